@@ -1,0 +1,5 @@
+"""Entry point: finds the command, maps errors to exit statuses."""
+
+
+def main() -> None:
+    """Run the command line."""

@@ -1,0 +1,1 @@
+"""Known answers: closed forms that tests, charts and README quote."""

@@ -1,0 +1,1 @@
+"""Orbits, and frames that are pure functions of their number."""

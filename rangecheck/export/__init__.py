@@ -1,0 +1,1 @@
+"""Files for others: STL, 3MF, PLY, pictures, maps, video."""

@@ -1,0 +1,104 @@
+"""Files that are whole or absent: everything is written beside its final name and then renamed.
+
+Also the one place that hashes inputs and that finds the presets, from a checkout as from an installed wheel.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from rangecheck.errors import InputError, OutputError
+
+
+@contextmanager
+def whole_file(path: str | Path, *, force: bool = True) -> Iterator[Path]:
+    """A temporary path beside `path`, with the same ending, that becomes `path` when the block ends without an error.
+
+    Raises OutputError when the folder cannot be written, or when `path` exists and `force` is False."""
+    path = Path(path)
+    if not force and path.exists():
+        raise OutputError(path, "exists already; pass --force to replace it")
+    if path.is_dir():
+        raise OutputError(path, "is a folder; name a file")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=f".part{path.suffix}", dir=path.parent)
+        os.close(handle)
+    except OSError as error:
+        raise OutputError(path, f"cannot be written ({error.strerror}); choose a folder you may write to") from None
+    part = Path(name)
+    try:
+        yield part
+        with part.open("rb+") as stream:
+            os.fsync(stream.fileno())
+        part.chmod(0o666 & ~_umask())
+        part.replace(path)
+    except OSError as error:
+        raise OutputError(path, f"could not be written ({error.strerror or error}); nothing was left under that name") from None
+    finally:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def write_bytes(path: str | Path, content: bytes, *, force: bool = True) -> None:
+    """Write `content` whole or not at all."""
+    with whole_file(path, force=force) as part:
+        part.write_bytes(content)
+
+
+def write_json(path: str | Path, document: Any, *, force: bool = True) -> None:
+    """Write `document` as indented JSON, whole or not at all. NaN is refused: JSON has none."""
+    write_bytes(path, (json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n").encode(), force=force)
+
+
+def read_json(path: str | Path) -> Any:
+    """The document in `path`. NaN and Infinity, which JSON does not have, are refused. Raises InputError."""
+
+    def refuse(word: str) -> Any:
+        raise ValueError(f"{word} is not a JSON number")
+
+    try:
+        return json.loads(read_bytes(path), parse_constant=refuse)
+    except (ValueError, RecursionError) as error:
+        raise InputError(path, f"is not valid JSON ({error}); correct it and try again") from None
+
+
+def read_bytes(path: str | Path, limit: int | None = None) -> bytes:
+    """The file's bytes (at most `limit`). Raises InputError in one line when it is missing, a folder, or unreadable."""
+    path = Path(path)
+    try:
+        with path.open("rb") as stream:
+            return stream.read() if limit is None else stream.read(limit)
+    except FileNotFoundError:
+        raise InputError(path, "does not exist; check the name") from None
+    except IsADirectoryError:
+        raise InputError(path, "is a folder, and a file is needed") from None
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror})") from None
+
+
+def sha256(path: str | Path) -> str:
+    """Hex digest of a file's content."""
+    return hashlib.sha256(read_bytes(path)).hexdigest()
+
+
+def presets_folder() -> Path:
+    """The folder of shipped presets: `configs/` in a checkout, `presets/` inside an installed package."""
+    package = Path(__file__).resolve().parent
+    for folder in (package / "presets", package.parent / "configs"):
+        if folder.is_dir():
+            return folder
+    raise InputError(package / "presets", "the shipped presets are missing; install rangecheck again")

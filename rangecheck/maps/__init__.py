@@ -1,0 +1,1 @@
+"""What needs no light: distance, depth, normals, surface IDs, contours."""

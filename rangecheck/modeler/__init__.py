@@ -1,0 +1,1 @@
+"""Solids from primitives and booleans, every face numbered; line drawings."""

@@ -1,0 +1,1 @@
+"""Pure functions of angles: Lambert, lobe, spike, masking, materials."""

@@ -1,0 +1,1 @@
+"""Sources, surroundings, materials on parts and a camera, as plain arrays."""

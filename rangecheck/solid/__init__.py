@@ -1,0 +1,1 @@
+"""`Solid`: a boundary that passed every check; checks, repair, closing, base, hollowing."""

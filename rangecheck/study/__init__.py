@@ -1,0 +1,1 @@
+"""Speed against accuracy, and stability; takes callables, imports no stage."""

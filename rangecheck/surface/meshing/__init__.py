@@ -1,0 +1,1 @@
+"""From scans to a surface: one file per method, one signature."""

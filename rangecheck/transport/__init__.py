@@ -1,0 +1,1 @@
+"""Radiance along rays: wavefront stages, the plan, the film."""

@@ -1,0 +1,29 @@
+"""Shared fixtures; where the real scans are."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def real_data_folder() -> Path | None:
+    """The folder of real scans (RANGECHECK_DATA, else ../shared/data), or None where it is absent."""
+    folder = Path(os.environ.get("RANGECHECK_DATA", ROOT.parent / "shared" / "data"))
+    return folder if (folder / "README.md").is_file() else None
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    """The folder of real scans; skips the test, with the reason, where it is absent."""
+    folder = real_data_folder()
+    if folder is None:
+        pytest.skip("no real scans here: set RANGECHECK_DATA to their folder")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def sample_data() -> Path:
+    """The scans that the project made itself."""
+    return ROOT / "sample_data"
