@@ -27,3 +27,21 @@ def real_data() -> Path:
 def sample_data() -> Path:
     """The scans that the project made itself."""
     return ROOT / "sample_data"
+
+
+_real_data_passed = 0
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    global _real_data_passed
+    if report.when == "call" and report.passed and "real_data" in report.keywords:
+        _real_data_passed += 1
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Where real scans are expected, a run that tested fewer than it should has failed."""
+    expected = int(os.environ.get("RANGECHECK_EXPECT_REAL_DATA", "0"))
+    if _real_data_passed < expected and session.exitstatus == pytest.ExitCode.OK:
+        print(f"\n{_real_data_passed} tests with real data passed; {expected} were expected")
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED

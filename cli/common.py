@@ -1,0 +1,179 @@
+"""Options that mean the same everywhere, and how results and progress are shown.
+
+Messages go to stderr, results to stdout; with --json stdout holds one JSON document and nothing else.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import sys
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from rangecheck.progress import Reporter
+
+if TYPE_CHECKING:
+    from rangecheck.pipeline import Outcome
+
+UNITS = ("mm", "cm", "m", "um", "in")
+
+
+class Size(click.ParamType):
+    """WxH in pixels."""
+
+    name = "WxH"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
+        if isinstance(value, tuple):
+            return value
+        try:
+            width, height = (int(part) for part in value.lower().split("x"))
+        except ValueError:
+            self.fail(f"{value!r} is not a size; write WIDTHxHEIGHT in pixels, for example 640x480", param, ctx)
+        return width, height
+
+
+class Point(click.ParamType):
+    """X,Y,Z in millimetres."""
+
+    name = "X,Y,Z"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
+        if isinstance(value, tuple):
+            return value
+        try:
+            x, y, z = (float(part) for part in value.split(","))
+        except ValueError:
+            self.fail(f"{value!r} is not a point; write X,Y,Z in millimetres, for example 0,150,900", param, ctx)
+        return x, y, z
+
+
+_OPTIONS: dict[str, Callable[..., Any]] = {
+    "unit": click.option("--unit", type=click.Choice(UNITS), help="Unit of length of inputs that do not say theirs."),
+    "out": click.option("--out", "out", type=click.Path(), required=True, metavar="DIR", help="Folder for the results."),
+    "out_file": click.option("-o", "--output", "out", type=click.Path(), required=True, metavar="FILE", help="Where to write the result."),
+    "out_dir": click.option("-o", "--out", "out", type=click.Path(), required=True, metavar="DIR", help="Folder for the results."),
+    "size": click.option("--size", type=Size(), help="Picture size in pixels, WIDTHxHEIGHT."),
+    "frames": click.option("--frames", type=click.IntRange(1), help="Frames of one full turn."),
+    "frames_dir": click.option("--frames-dir", type=click.Path(), metavar="DIR", help="Where frames are kept between runs."),
+    "material": click.option("--material", metavar="NAME", help="A material of configs/materials, or a material file."),
+    "tolerance": click.option("--tolerance", metavar="P%", callback=lambda c, p, v: _percent(v), help="Allowed error of light, per cent of the frame's mean."),
+    "threads": click.option("--threads", type=click.IntRange(0), help="Threads to use; results do not depend on it. 0: all cores."),
+    "seed": click.option("--seed", type=click.IntRange(0), help="Seed of every random number."),
+    "config": click.option("--config", metavar="FILE", help="Settings: a TOML file or a preset (quick, normal, fine)."),
+    "set": click.option("--set", "assignments", multiple=True, metavar="KEY=VALUE", help="One setting, for example turntable.frames=72."),
+    "json": click.option("--json", "as_json", is_flag=True, help="Print one JSON document on stdout and nothing else."),
+    "force": click.option("--force", is_flag=True, help="Replace existing results."),
+}
+
+
+def _percent(text: str | None) -> float | None:
+    if text is None:
+        return None
+    try:
+        return float(text.rstrip("%"))
+    except ValueError:
+        raise click.BadParameter(f"{text!r} is not a percentage; write for example 0.5%") from None
+
+
+def common(*names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Add the named options, and always --json, --threads, -v and -q."""
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(function)
+        def command(*args: Any, verbose: int, quiet: bool, threads: int | None, as_json: bool, **kwargs: Any) -> int:
+            if threads:
+                from rangecheck import kernels
+
+                kernels.set_threads(threads)
+            reporter = ConsoleReporter(-1 if quiet else verbose)
+            try:
+                outcome: Outcome = function(*args, reporter=reporter, **kwargs)
+            finally:
+                reporter.close()
+            return show(outcome, as_json)
+
+        command = click.option("-q", "--quiet", is_flag=True, help="No progress, no notes.")(command)
+        command = click.option("-v", "--verbose", count=True, help="More about what is done.")(command)
+        for name in reversed(("json", "threads")):
+            command = _OPTIONS[name](command)
+        for name in reversed(names):
+            command = _OPTIONS[name](command)
+        return command
+
+    return decorate
+
+
+def show(outcome: Outcome, as_json: bool) -> int:
+    """Print an outcome; exit status 0 when what was inspected is fit, else 1."""
+    if as_json:
+        click.echo(json.dumps(outcome.document, indent=1, allow_nan=False, ensure_ascii=False))
+    else:
+        for line in outcome.lines:
+            click.echo(line)
+    return 0 if outcome.fit else 1
+
+
+class ConsoleReporter(Reporter):
+    """Progress on stderr: a live bar on a terminal, one plain line a stage elsewhere."""
+
+    def __init__(self, verbosity: int) -> None:
+        super().__init__()
+        self.verbosity = verbosity
+        self._bar: Any = None
+        self._task: Any = None
+        if verbosity >= 0 and sys.stderr.isatty():
+            from rich.console import Console
+            from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+            self._bar = Progress(
+                TextColumn("{task.description:<28}"),
+                BarColumn(bar_width=30),
+                MofNCompleteColumn(),
+                TimeElapsedColumn(),
+                TimeRemainingColumn(),
+                console=Console(stderr=True),
+                transient=False,
+            )
+            self._bar.start()
+
+    def note(self, text: str) -> None:
+        super().note(text)
+        if self.verbosity < 0:
+            return
+        if self._bar is not None:
+            self._bar.console.print(text, highlight=False, markup=False)
+        else:
+            click.echo(text, err=True)
+
+    def begin(self, name: str, total: int) -> None:
+        if self._bar is not None:
+            self._task = self._bar.add_task(name, total=total or 1)
+
+    def advance(self, done: int) -> None:
+        if self._bar is not None and self._task is not None:
+            self._bar.update(self._task, completed=done)
+
+    def end(self, name: str, seconds: float) -> None:
+        if self._bar is not None and self._task is not None:
+            total = self._bar.tasks[self._task].total
+            self._bar.update(self._task, completed=total)
+            self._task = None
+        elif self.verbosity >= 0:
+            click.echo(f"{name}: {seconds:.1f} s", err=True)
+
+    def close(self) -> None:
+        """Leave the terminal as it was."""
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+
+
+def settings_from(config: str | None, assignments: tuple[str, ...], **overrides: Any) -> Any:
+    """Resolved settings; dunder names in `overrides` stand for dots (turntable__frames)."""
+    from rangecheck.config import load_settings
+
+    return load_settings(config, assignments, {key.replace("__", "."): value for key, value in overrides.items()})

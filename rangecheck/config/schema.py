@@ -1,0 +1,98 @@
+"""Every setting, with its unit in its name, its range and its default beside it.
+
+Unknown keys are refused with the nearest known name. Lengths in millimetres, angles in degrees unless the name says otherwise.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Degrees = Annotated[float, Field(ge=-90, le=90, allow_inf_nan=False)]
+
+
+class Section(BaseModel):
+    """Base of all sections: immutable, no unknown keys."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
+
+
+class Meshing(Section):
+    """From scans to one surface."""
+
+    method: Literal["auto", "grid", "fuse", "poisson", "pivot"] = Field("auto", description="how scans become triangles; auto chooses and says why")
+    voxel_mm: Positive | None = Field(None, description="edge of a fusion cell; without it, from the scans' own sample spacing")
+    max_angle_deg: Annotated[float, Field(gt=0, lt=90)] = Field(
+        80.0, description="a grid triangle whose normal leans further than this from the line of sight is a depth jump and is left out"
+    )
+
+
+class Solidify(Section):
+    """From a surface to a part that can be built."""
+
+    relief_depth_mm: Positive = Field(20.0, description="how far behind its deepest point a relief from one view gets its back plane")
+    base: Literal["auto", "none"] = Field("auto", description="auto cuts the bust flat where its lower end is ragged or invented")
+    base_height_mm: float | None = Field(None, description="height of the base plane above the lowest point; overrides auto")
+    height_mm: Positive | None = Field(None, description="scale the finished part to this height")
+
+
+class Picture(Section):
+    """The camera's sensor and lens."""
+
+    width: Annotated[int, Field(ge=8, le=16384)] = 512
+    height: Annotated[int, Field(ge=8, le=16384)] = 512
+    field_of_view_deg: Annotated[float, Field(gt=0.5, lt=150)] = Field(25.0, description="horizontal")
+
+
+class Light(Section):
+    """How light is followed."""
+
+    materials: tuple[str, ...] = Field(("plaster", "steel"), description="one turntable each; names of configs/materials or paths of material files")
+    model: Literal["plan", "full", "report"] = Field(
+        "plan", description="plan: as much as the tolerance asks for; full: reference; report: the approximations of the 1991 report"
+    )
+    tolerance_percent: Annotated[float, Field(gt=0, le=50)] = Field(0.5, description="of the frame's mean radiance")
+
+
+class Turntable(Section):
+    """The orbit around the bust."""
+
+    frames: Annotated[int, Field(ge=1, le=100_000)] = 36
+    elevation_deg: Degrees = 8.0
+    margin: Annotated[float, Field(ge=0, lt=1)] = Field(0.06, description="share of the frame left free on every side")
+    fps: Annotated[int, Field(ge=1, le=240)] = 12
+
+
+class Maps(Section):
+    """Distance maps."""
+
+    azimuths_deg: tuple[float, ...] = Field((0.0, 35.0), description="focal points on the orbit from which distance maps are made")
+    elevation_deg: Degrees = 20.0
+    contour_step_mm: Positive | None = Field(None, description="depth between contour lines; without it, chosen to give about 25 lines")
+
+
+class Checking(Section):
+    """What a verdict is measured against."""
+
+    max_invented_percent: Annotated[float, Field(ge=0, le=100)] = Field(
+        25.0, description="share of the surface above the base that may be invented before the scans are called unfit"
+    )
+    severities: dict[str, Literal["ignore", "note", "warning", "error"]] = Field(
+        default_factory=dict, description="overrides by finding code"
+    )
+
+
+class Settings(Section):
+    """Everything that can be set."""
+
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    threads: Annotated[int, Field(ge=0, le=1024)] = Field(0, description="0 means all cores; results do not depend on it")
+    meshing: Meshing = Meshing()
+    solid: Solidify = Solidify()
+    picture: Picture = Picture()
+    light: Light = Light()
+    turntable: Turntable = Turntable()
+    maps: Maps = Maps()
+    checking: Checking = Checking()

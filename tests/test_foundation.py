@@ -1,0 +1,117 @@
+"""Errors keep what they measured; arrays are refused by name; rigid motions undo themselves; files are whole or absent."""
+
+import json
+import math
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rangecheck import arrays, errors, files, kernels, rigid
+from rangecheck.config import load_settings
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def test_an_error_keeps_what_it_measured():
+    error = errors.SurfaceError("surface is open: 3 boundary edges", edges=3)
+    assert error.edges == 3
+    assert error.measured == {"edges": 3}
+
+
+def test_a_wrong_array_is_refused_by_its_name():
+    with pytest.raises(errors.ArrayError, match=r"points_mm has shape \(2, 2\); it must be \(n, 3\)"):
+        arrays.require("points_mm", [[1, 2], [3, 4]], (None, 3))
+    with pytest.raises(errors.ArrayError, match=r"1 values that are not finite, the first at index \(1, 0\)"):
+        arrays.require("points_mm", [[1, 2, 3], [math.nan, 0, 0]], (None, 3), finite=True)
+    with pytest.raises(errors.ArrayError, match="unit is 'furlong'"):
+        arrays.mm_per("furlong")
+
+
+unit_interval = st.floats(-1, 1)
+
+
+@given(st.tuples(*[unit_interval] * 4).filter(lambda q: sum(x * x for x in q) > 0.01), st.tuples(*[unit_interval] * 3))
+def test_a_rigid_motion_forth_and_back_is_the_identity(quaternion, translation):
+    motion = rigid.from_rotation_translation(rigid.rotation_from_quaternion(quaternion), np.array(translation) * 1000)
+    points = np.random.default_rng(1).normal(size=(5, 3)) * 100
+    back = rigid.move_points(rigid.inverse(motion), rigid.move_points(motion, points))
+    assert np.abs(back - points).max() < 64 * np.spacing(1000.0)
+
+
+def test_a_camera_that_looks_at_a_point_has_it_ahead_and_stands_upright():
+    world_from_camera = rigid.look_at([0, 0, 500], [0, 100, 0])
+    ahead = rigid.move_points(rigid.inverse(world_from_camera), np.array([[0.0, 100, 0]]))[0]
+    assert np.allclose(ahead, [0, 0, math.hypot(500, 100)])
+    assert rigid.move_directions(world_from_camera, np.array([0.0, 1, 0]))[1] < 0  # the picture's down is the world's down
+    assert np.linalg.det(rigid.look_at([0, 9, 0], [0, 0, 0])[:3, :3]) == pytest.approx(1)  # up along the view
+
+
+def test_the_angle_of_a_rotation_is_stable_near_zero_and_pi():
+    for angle in (0.0, 1e-9, 1.0, math.pi - 1e-9, math.pi):
+        assert rigid.angle_rad(rigid.about_axis([1, 2, 3], angle)) == pytest.approx(angle, abs=1e-12)
+
+
+@pytest.mark.parametrize("matrix", [np.diag([1, 1, -1, 1.0]), np.diag([2, 2, 2, 1.0]), np.full((4, 4), math.nan)])
+def test_a_mirror_a_scale_and_nan_are_no_rigid_motions(matrix):
+    with pytest.raises(errors.ArrayError):
+        rigid.checked(matrix)
+
+
+def test_chunks_come_back_in_order_on_any_number_of_threads():
+    for count in (1, 2, 5):
+        with kernels.threads(count):
+            assert sum(kernels.in_chunks(lambda a, b: list(range(a, b)), 1003, 100), []) == list(range(1003))
+
+
+def test_a_file_is_whole_or_absent(tmp_path):
+    target = tmp_path / "sub folder" / "ü.bin"
+    with pytest.raises(RuntimeError), files.whole_file(target) as part:
+        part.write_bytes(b"half")
+        raise RuntimeError
+    assert list(target.parent.iterdir()) == []
+    files.write_bytes(target, b"whole")
+    assert target.read_bytes() == b"whole"
+    with pytest.raises(errors.OutputError, match="pass --force"):
+        files.write_bytes(target, b"other", force=False)
+
+
+def test_json_refuses_what_json_does_not_have(tmp_path):
+    (tmp_path / "a.json").write_text('{"x": NaN}')
+    with pytest.raises(errors.InputError, match="not valid JSON"):
+        files.read_json(tmp_path / "a.json")
+    with pytest.raises(ValueError, match="Out of range"):
+        files.write_json(tmp_path / "b.json", {"x": math.nan})
+    assert not (tmp_path / "b.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("assignment", "message"),
+    [
+        ("turntable.frmes=3", "did you mean turntable.frames?"),
+        ("turntable.frames=0", "greater than or equal to 1"),
+        ("nothing=1", "unknown; known here: seed"),
+        ("turntable=3", "valid dictionary"),
+        ("turntable.frames", "takes key=value"),
+    ],
+)
+def test_a_wrong_setting_is_refused_with_its_path(assignment, message):
+    with pytest.raises(errors.SettingError, match=message.replace("?", r"\?")):
+        load_settings(None, [assignment])
+
+
+def test_presets_load_and_single_options_win():
+    settings = load_settings("quick", ["turntable.frames=5"], {"turntable.frames": 7, "seed": None})
+    assert (settings.turntable.frames, settings.picture.width, settings.seed) == (7, 256, 0)
+    for preset in files.presets_folder().glob("*.toml"):
+        load_settings(preset)
+    json.dumps(load_settings("fine").model_dump(mode="json"), allow_nan=False)
+
+
+def test_every_package_folder_is_listed_for_the_wheel():
+    listed = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"])
+    found = {".".join(p.parent.relative_to(ROOT).parts) for p in (ROOT / "rangecheck").rglob("__init__.py")}
+    assert listed == found | {"rangecheck.presets", "rangecheck_cli"}
