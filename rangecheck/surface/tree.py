@@ -1,0 +1,138 @@
+"""A tree of boxes over a surface's faces: what distances and intersections share.
+
+Faces are split at the median of their centroids along the widest axis, level by level, so that the tree is complete and needs no
+pointers: node i has children 2 i + 1 and 2 i + 2, and leaf k of 2^depth holds the faces k n >> depth to (k + 1) n >> depth of
+`order`. Float64 millimetres about the centre of the surface's box, so that distance from the origin costs no digits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from rangecheck.arrays import FloatArray, IntArray
+from rangecheck.errors import SurfaceError
+from rangecheck.kernels import in_chunks, kernel
+from rangecheck.surface.surface import Surface
+
+FACES_PER_LEAF = 4
+#: levels split on one thread before subtrees are handed to several
+_SHARED_LEVELS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class TriangleTree:
+    """Boxes over m faces.
+
+    order   (m,) int32 face in each place of the tree
+    corners (m, 9) float64 its three corners, relative to `centre_mm`
+    boxes   (2^(depth + 1) - 1, 6) float64 low and high corner of each node, relative to `centre_mm`
+    depth   levels below the root
+    """
+
+    order: IntArray = field(repr=False)
+    corners: FloatArray = field(repr=False)
+    boxes: FloatArray = field(repr=False)
+    depth: int
+    centre_mm: FloatArray
+
+
+_trees: WeakKeyDictionary[Surface, TriangleTree] = WeakKeyDictionary()
+
+
+def triangle_tree(surface: Surface) -> TriangleTree:
+    """The tree of `surface`, built once and kept as long as the surface lives. Raises SurfaceError without faces."""
+    tree = _trees.get(surface)
+    if tree is None:
+        tree = _trees[surface] = _build(surface)
+    return tree
+
+
+def _build(surface: Surface) -> TriangleTree:
+    n = len(surface.faces)
+    if n == 0:
+        raise SurfaceError("the surface has no faces; there is nothing to measure against")
+    depth = max(0, int(np.ceil(np.log2(n / FACES_PER_LEAF))))
+    centre = surface.bounds_mm.mean(axis=0)
+    corners = (surface.vertices - centre)[surface.faces].reshape(n, 9)
+    keys = corners[:, 0:3] + corners[:, 3:6] + corners[:, 6:9]
+    order = np.arange(n, dtype=np.int32)
+    shared = min(_SHARED_LEVELS, depth)
+    arrange(keys, order, 0, 0, shared, depth)
+    if depth > shared:
+        in_chunks(lambda first, _: arrange(keys, order, shared, first, depth, depth), 1 << shared, 1)
+    corners = corners[order]
+    boxes = np.empty(((2 << depth) - 1, 6))
+    leaves = 1 << depth
+    in_chunks(lambda first, last: leaf_boxes(corners, depth, first, last, boxes), leaves, 1 << 14)
+    for level in range(depth - 1, -1, -1):
+        below = boxes[(2 << level) - 1 : (4 << level) - 1].reshape(-1, 2, 6)
+        here = boxes[(1 << level) - 1 : (2 << level) - 1]
+        np.minimum(below[:, 0, :3], below[:, 1, :3], out=here[:, :3])
+        np.maximum(below[:, 0, 3:], below[:, 1, 3:], out=here[:, 3:])
+    return TriangleTree(order, corners, boxes, depth, centre)
+
+
+@kernel
+def arrange(keys, order, level, node, stop_level, depth):
+    """Sort `order` (and `keys` with it) so that the subtree of `node` at `level` is split down to `stop_level`."""
+    n = len(order)
+    for current in range(level, stop_level):
+        first = node << (current - level)
+        for k in range(first, first + (1 << (current - level))):
+            start, middle, stop = (k * n) >> current, ((2 * k + 1) * n) >> (current + 1), ((k + 1) * n) >> current
+            widest, axis = -1.0, 0
+            for a in range(3):
+                low = high = keys[start, a]
+                for i in range(start + 1, stop):
+                    value = keys[i, a]
+                    if value < low:
+                        low = value
+                    elif value > high:
+                        high = value
+                if high - low > widest:
+                    widest, axis = high - low, a
+            _select(keys, order, start, middle, stop - 1, axis)
+
+
+@kernel
+def _select(keys, order, left, middle, right, axis):
+    """Hoare's selection: afterwards nothing before `middle` is larger along `axis` than anything from it on."""
+    while left < right:
+        a, b, c = keys[left, axis], keys[(left + right) >> 1, axis], keys[right, axis]
+        pivot = max(min(a, b), min(max(a, b), c))
+        i, j = left, right
+        while i <= j:
+            while keys[i, axis] < pivot:
+                i += 1
+            while keys[j, axis] > pivot:
+                j -= 1
+            if i <= j:
+                for k in range(3):
+                    keys[i, k], keys[j, k] = keys[j, k], keys[i, k]
+                order[i], order[j] = order[j], order[i]
+                i += 1
+                j -= 1
+        if middle <= j:
+            right = j
+        elif middle >= i:
+            left = i
+        else:
+            return
+
+
+@kernel
+def leaf_boxes(corners, depth, first, last, boxes):
+    """Boxes of the leaves `first` to `last`."""
+    n = len(corners)
+    for leaf in range(first, last):
+        node = (1 << depth) - 1 + leaf
+        for axis in range(3):
+            low, high = np.inf, -np.inf
+            for i in range((leaf * n) >> depth, ((leaf + 1) * n) >> depth):
+                for corner in range(3):
+                    value = corners[i, 3 * corner + axis]
+                    low, high = min(low, value), max(high, value)
+            boxes[node, axis], boxes[node, 3 + axis] = low, high
