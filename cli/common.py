@@ -54,17 +54,30 @@ class Point(click.ParamType):
 _OPTIONS: dict[str, Callable[..., Any]] = {
     "unit": click.option("--unit", type=click.Choice(UNITS), help="Unit of length of inputs that do not say theirs."),
     "out": click.option("--out", "out", type=click.Path(), required=True, metavar="DIR", help="Folder for the results."),
-    "out_file": click.option("-o", "--output", "out", type=click.Path(), required=True, metavar="FILE", help="Where to write the result."),
-    "out_dir": click.option("-o", "--out", "out", type=click.Path(), required=True, metavar="DIR", help="Folder for the results."),
+    "out_file": click.option(
+        "-o", "--output", "out", type=click.Path(), required=True, metavar="FILE", help="Where to write the result."
+    ),
+    "out_dir": click.option(
+        "-o", "--out", "out", type=click.Path(), required=True, metavar="DIR", help="Folder for the results."
+    ),
     "size": click.option("--size", type=Size(), help="Picture size in pixels, WIDTHxHEIGHT."),
     "frames": click.option("--frames", type=click.IntRange(1), help="Frames of one full turn."),
     "frames_dir": click.option("--frames-dir", type=click.Path(), metavar="DIR", help="Where frames are kept between runs."),
     "material": click.option("--material", metavar="NAME", help="A material of configs/materials, or a material file."),
-    "tolerance": click.option("--tolerance", metavar="P%", callback=lambda c, p, v: _percent(v), help="Allowed error of light, per cent of the frame's mean."),
-    "threads": click.option("--threads", type=click.IntRange(0), help="Threads to use; results do not depend on it. 0: all cores."),
+    "tolerance": click.option(
+        "--tolerance",
+        metavar="P%",
+        callback=lambda c, p, v: _percent(v),
+        help="Allowed error of light, per cent of the frame's mean.",
+    ),
+    "threads": click.option(
+        "--threads", type=click.IntRange(0), help="Threads to use; results do not depend on it. 0: all cores."
+    ),
     "seed": click.option("--seed", type=click.IntRange(0), help="Seed of every random number."),
     "config": click.option("--config", metavar="FILE", help="Settings: a TOML file or a preset (quick, normal, fine)."),
-    "set": click.option("--set", "assignments", multiple=True, metavar="KEY=VALUE", help="One setting, for example turntable.frames=72."),
+    "set": click.option(
+        "--set", "assignments", multiple=True, metavar="KEY=VALUE", help="One setting, for example turntable.frames=72."
+    ),
     "json": click.option("--json", "as_json", is_flag=True, help="Print one JSON document on stdout and nothing else."),
     "force": click.option("--force", is_flag=True, help="Replace existing results."),
 }

@@ -57,7 +57,9 @@ class Commands(click.Group):
         return super().resolve_command(ctx, args)
 
 
-@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110}, no_args_is_help=True)
+@click.group(
+    cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110}, no_args_is_help=True
+)
 @click.version_option(package_name="rangecheck", prog_name="rangecheck")
 def cli() -> None:
     """Range scans of a head or sculpture in; a checked, physically rendered bust and its STL out.

@@ -1,0 +1,123 @@
+"""What is installed, what is missing, and the one line that mends it."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import os
+import platform
+import sys
+import tempfile
+from pathlib import Path
+
+from rangecheck import __version__, kernels
+from rangecheck.errors import RangecheckError
+from rangecheck.files import presets_folder
+from rangecheck.pipeline.outcome import Outcome, document
+
+#: import name -> (distribution, what it is for, needed by the main job, the line that installs it)
+PACKAGES = {
+    "numpy": ("numpy", "arrays", True),
+    "scipy": ("scipy", "sparse solves", True),
+    "numba": ("numba", "compiled kernels", True),
+    "embreex": ("embreex", "rays", True),
+    "trimesh": ("trimesh", "mesh files", True),
+    "manifold3d": ("manifold3d", "solids and booleans", True),
+    "cv2": ("opencv-contrib-python-headless", "images and structured light", True),
+    "imageio_ffmpeg": ("imageio-ffmpeg", "video", True),
+    "matplotlib": ("matplotlib", "charts", True),
+    "open3d": ("open3d", "Poisson meshing, ball pivoting, registration", False),
+    "pymeshlab": ("pymeshlab", "second opinions, repair", False),
+    "pye57": ("pye57", "E57 scans", False),
+    "lib3mf": ("lib3mf", "3MF files", False),
+    "OpenEXR": ("openexr", "EXR maps", False),
+    "distributed": ("distributed", "frames on many machines", False),
+}
+EXTRA = {
+    "open3d": "engines",
+    "pymeshlab": "engines",
+    "pye57": "formats",
+    "lib3mf": "formats",
+    "OpenEXR": "formats",
+    "distributed": "distributed",
+}
+OPEN3D_SYSTEM = "apt-get install libusb-1.0-0 libegl1 libgl1 libx11-6 libidn2-0 libgomp1"
+
+
+def doctor() -> Outcome:
+    """Check packages, system libraries, cores, the video encoder, presets and a writable cache."""
+    rows: list[dict[str, object]] = []
+
+    def row(name: str, state: str, detail: str, mend: str = "", needed: bool = True) -> None:
+        rows.append({"name": name, "state": state, "detail": detail, "mend": mend, "needed": needed})
+
+    row("python", "ok", f"{platform.python_version()} on {platform.system()} {platform.machine()}")
+    row("cores", "ok", f"{kernels.thread_count()} usable")
+    for module, (distribution, purpose, needed) in PACKAGES.items():
+        install = f"pip install 'rangecheck[{EXTRA[module]}]'" if module in EXTRA else f"pip install {distribution}"
+        try:
+            version = importlib.metadata.version(distribution)
+        except importlib.metadata.PackageNotFoundError:
+            row(module, "missing", purpose, install, needed)
+            continue
+        try:
+            importlib.import_module(module)
+        except (ImportError, OSError) as error:
+            mend = OPEN3D_SYSTEM if module == "open3d" else f"{install} --force-reinstall"
+            row(module, "broken", f"{version} does not load: {str(error).splitlines()[0]}", mend, needed)
+        else:
+            row(module, "ok", f"{version}, {purpose}", needed=needed)
+    _check_encoder(row)
+    try:
+        row("presets", "ok", f"{len(list(presets_folder().rglob('*.toml')))} files in {presets_folder()}")
+    except RangecheckError as error:
+        row("presets", "missing", str(error), "pip install --force-reinstall rangecheck")
+    _check_cache(row)
+    fit = all(r["state"] == "ok" for r in rows if r["needed"])
+    marks = {"ok": "ok     ", "missing": "MISSING", "broken": "BROKEN "}
+    lines = [
+        f"{marks[str(r['state'])]} {r['name']!s:<15} {r['detail']}" + (f"\n        mend with: {r['mend']}" if r["mend"] else "")
+        for r in rows
+    ]
+    lines.append("everything needed is here" if fit else "something that the main job needs is missing")
+    return Outcome(document("doctor", version=__version__, fit=fit, checks=rows), lines, fit)
+
+
+def _check_encoder(row) -> None:
+    from rangecheck.export.video import find_encoder
+
+    try:
+        row("encoder", "ok", str(find_encoder()))
+    except RangecheckError as error:
+        row("encoder", "missing", str(error), "pip install imageio-ffmpeg")
+
+
+def _check_cache(row) -> None:
+    """numba keeps compiled kernels beside the source, else in the user's cache; where neither can be written, every start compiles."""
+    package = Path(__file__).resolve().parent
+    for folder in (Path(os.environ.get("NUMBA_CACHE_DIR", package)), Path.home() / ".cache"):
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                row("kernel cache", "ok", str(folder))
+                return
+        except OSError:
+            continue
+    row(
+        "kernel cache",
+        "missing",
+        "no folder for compiled kernels can be written: every start compiles anew",
+        "export NUMBA_CACHE_DIR=/a/folder",
+        False,
+    )
+
+
+def versions() -> dict[str, str]:
+    """Versions of rangecheck, Python and the packages that results depend on."""
+    found = {"rangecheck": __version__, "python": sys.version.split()[0]}
+    for distribution, _, _ in PACKAGES.values():
+        try:
+            found[distribution] = importlib.metadata.version(distribution)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found
