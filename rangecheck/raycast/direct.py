@@ -1,0 +1,302 @@
+"""Embree's C interface, called from compiled code without the interpreter in between.
+
+embreex casts one ray per call of Embree; its wheel also carries Embree itself, whose packets of 16 neighbouring rays cost about half
+as much. Layouts are those of Embree 4 (rtcore_ray.h, rtcore_common.h); `load` proves them on a known triangle before they are used,
+and answers None (embreex then serves alone) where the library is not found, is not what it should be, or nothing is compiled.
+
+Local frame: centred and scaled so that the triangles fill [-1, 1]; float32, unit directions.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import weakref
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+
+from rangecheck.arrays import FloatArray, IntArray
+from rangecheck.kernels import inline_kernel, kernel
+
+_POINTER = ctypes.c_void_p
+_SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
+    "rtcNewDevice": (_POINTER, [ctypes.c_char_p]),
+    "rtcGetDeviceProperty": (ctypes.c_ssize_t, [_POINTER, ctypes.c_int]),
+    "rtcGetDeviceError": (ctypes.c_int, [_POINTER]),
+    "rtcNewScene": (_POINTER, [_POINTER]),
+    "rtcSetSceneFlags": (None, [_POINTER, ctypes.c_int]),
+    "rtcCommitScene": (None, [_POINTER]),
+    "rtcReleaseScene": (None, [_POINTER]),
+    "rtcNewGeometry": (_POINTER, [_POINTER, ctypes.c_int]),
+    "rtcSetNewGeometryBuffer": (
+        _POINTER,
+        [_POINTER, ctypes.c_int, ctypes.c_uint, ctypes.c_int, ctypes.c_size_t, ctypes.c_size_t],
+    ),
+    "rtcCommitGeometry": (None, [_POINTER]),
+    "rtcAttachGeometry": (ctypes.c_uint, [_POINTER, _POINTER]),
+    "rtcReleaseGeometry": (None, [_POINTER]),
+    "rtcIntersect1": (None, [_POINTER] * 3),
+    "rtcOccluded1": (None, [_POINTER] * 3),
+    "rtcIntersect16": (None, [_POINTER] * 4),
+    "rtcOccluded16": (None, [_POINTER] * 4),
+}
+_TRIANGLES, _INDEX_BUFFER, _VERTEX_BUFFER, _UINT3, _FLOAT3 = 0, 0, 1, 0x5003, 0x9003
+_ROBUST = 1 << 2  # watertight at shared edges
+_PROPERTY_RAY16 = 34
+_COHERENT = 1 << 16
+
+# words of 4 bytes in RTCRayHit (one ray); in RTCRayHit16 each is a row of 16
+_ORIGIN, _NEAR, _DIRECTION, _TIME, _FAR, _MASK, _ID, _FLAGS, _U, _V, _PRIMITIVE, _GEOMETRY, _INSTANCE = (
+    0, 3, 4, 7, 8, 9, 10, 11, 15, 16, 17, 18, 19,
+)  # fmt: skip
+_WORDS = 24
+
+
+@cache
+def load() -> ctypes.CDLL | None:
+    """The Embree that embreex carries, or None where it cannot be called directly."""
+    if numba.config.DISABLE_JIT:
+        return None
+    import embreex
+
+    package = Path(embreex.__file__).parent
+    folders = (package.with_name("embreex.libs"), package / ".dylibs", package)
+    for found in (path for folder in folders for path in sorted(folder.glob("*embree4*"))):
+        try:
+            library = ctypes.CDLL(str(found))
+            for name, (result, arguments) in _SIGNATURES.items():
+                function = getattr(library, name)
+                function.restype, function.argtypes = result, arguments
+        except (OSError, AttributeError):
+            continue
+        return library if _proved(library) else None
+    return None
+
+
+@cache
+def _device() -> int:
+    library = load()
+    assert library is not None
+    # one thread builds: the tree, and so which of two faces wins at their shared edge, is then the same on every machine
+    return library.rtcNewDevice(b"threads=1")
+
+
+def _proved(library: ctypes.CDLL) -> bool:
+    """Whether one triangle answers single rays and packets as the layouts above say it must."""
+    device = library.rtcNewDevice(b"threads=1")
+    if not device or library.rtcGetDeviceProperty(device, _PROPERTY_RAY16) != 1:
+        return False
+    corners = np.array([[0, 0, 0.5], [1, 0, 0.5], [0, 1, 0.5]], np.float32)
+    tree = DirectScene(corners, np.array([[0, 1, 2]], np.int32), library, device)
+    origins = np.tile(np.array([0.25, 0.5, -0.5], np.float32), (17, 1))
+    origins[16, 0] = 2.0
+    directions = np.tile(np.array([0, 0, 1], np.float32), (17, 1))
+    for coherent in (False, True):
+        far, face = np.full(17, 9, np.float32), np.zeros(17, np.int32)
+        u, v = np.zeros(17, np.float32), np.zeros(17, np.float32)
+        blocked = np.zeros(17, np.bool_)
+        tree.closest(origins, directions, far, face, u, v, coherent)
+        tree.occluded(origins, directions, np.full(17, 0.5 if coherent else 2.0, np.float32), blocked, coherent)
+        right = (far[:16] == 1).all() and (u[:16] == 0.25).all() and (v[:16] == 0.5).all() and (face[:16] == 0).all()
+        if not (right and face[16] == -1 and (blocked[:16] != coherent).all() and not blocked[16]):
+            return False
+    return True
+
+
+class DirectScene:
+    """Triangles (n, 3) float32 local, (m, 3) int32 in one Embree scene."""
+
+    def __init__(
+        self, vertices: FloatArray, faces: IntArray, library: ctypes.CDLL | None = None, device: int | None = None
+    ) -> None:
+        library, device = library or load(), device or _device()
+        assert library is not None
+        self._scene = library.rtcNewScene(device)
+        library.rtcSetSceneFlags(self._scene, _ROBUST)
+        geometry = library.rtcNewGeometry(device, _TRIANGLES)
+        for kind, form, values in ((_VERTEX_BUFFER, _FLOAT3, vertices), (_INDEX_BUFFER, _UINT3, faces)):
+            values = np.ascontiguousarray(values)
+            place = library.rtcSetNewGeometryBuffer(geometry, kind, 0, form, 12, len(values))
+            ctypes.memmove(place, values.ctypes.data, values.nbytes)
+        library.rtcCommitGeometry(geometry)
+        library.rtcAttachGeometry(self._scene, geometry)
+        library.rtcReleaseGeometry(geometry)
+        library.rtcCommitScene(self._scene)
+        weakref.finalize(self, library.rtcReleaseScene, self._scene)
+        self._address = {
+            name: ctypes.cast(getattr(library, name), _POINTER).value
+            for name in ("rtcIntersect1", "rtcIntersect16", "rtcOccluded1", "rtcOccluded16")
+        }
+
+    def closest(
+        self,
+        origins: FloatArray,
+        directions: FloatArray,
+        far: FloatArray,
+        face: IntArray,
+        u: FloatArray,
+        v: FloatArray,
+        coherent: bool,
+    ) -> None:
+        """Fill `far`, `face` (-1 = missed), `u`, `v` with the first hits; `far` comes in as the reach of each ray."""
+        if coherent:
+            _closest_packets(self._address["rtcIntersect16"], self._scene, origins, directions, far, face, u, v)
+        else:
+            _closest_single(self._address["rtcIntersect1"], self._scene, origins, directions, far, face, u, v)
+
+    def occluded(self, origins: FloatArray, directions: FloatArray, far: FloatArray, blocked: Any, coherent: bool) -> None:
+        """Fill `blocked` (n,) bool: whether anything lies within `far` of each ray's origin."""
+        if coherent:
+            _occluded_packets(self._address["rtcOccluded16"], self._scene, origins, directions, far, blocked)
+        else:
+            _occluded_single(self._address["rtcOccluded1"], self._scene, origins, directions, far, blocked)
+
+
+def _call(arguments: int) -> Any:
+    def typed(context, address, *rest):
+        signature = types.void(*([types.intp] * (arguments + 1)))
+
+        def generate(context, builder, signature, values):
+            word = context.get_value_type(types.intp)
+            function = ir.FunctionType(ir.VoidType(), [word] * arguments)
+            builder.call(builder.inttoptr(values[0], function.as_pointer()), values[1:])
+            return context.get_dummy_value()
+
+        return signature, generate
+
+    return typed
+
+
+@intrinsic
+def _call3(context, address, a, b, c):
+    """Call the C function at `address` with three words."""
+    return _call(3)(context, address, a, b, c)
+
+
+@intrinsic
+def _call4(context, address, a, b, c, d):
+    """Call the C function at `address` with four words."""
+    return _call(4)(context, address, a, b, c, d)
+
+
+@inline_kernel
+def _aligned(words):
+    """`words` float32 of zeros that start on a 64-byte line, as Embree's packets must."""
+    room = np.zeros(words + 16, np.float32)
+    skip = (-room.ctypes.data % 64) // 4
+    return room[skip : skip + words]
+
+
+@inline_kernel
+def _coherent_arguments():
+    """RTCIntersectArguments (and RTCOccludedArguments): coherent rays, all features, no context, no filters."""
+    arguments = _aligned(16)
+    words = arguments.view(np.int32)
+    words[0] = _COHERENT
+    words[1] = -1
+    return arguments
+
+
+@inline_kernel
+def _finite_ray(origins, directions, i):
+    total = origins[i, 0] + origins[i, 1] + origins[i, 2] + directions[i, 0] + directions[i, 1] + directions[i, 2]
+    return total - total == 0.0
+
+
+@kernel
+def _closest_single(function, scene, origins, directions, far, face, u, v):
+    """One ray per call: best where neighbouring rays have little in common."""
+    ray = _aligned(_WORDS)
+    words = ray.view(np.int32)
+    place = ray.ctypes.data
+    for i in range(len(origins)):
+        for axis in range(3):
+            ray[_ORIGIN + axis] = origins[i, axis]
+            ray[_DIRECTION + axis] = directions[i, axis]
+        ray[_NEAR] = ray[_TIME] = 0.0
+        ray[_FAR] = far[i]
+        words[_MASK] = -1
+        words[_ID] = words[_FLAGS] = 0
+        words[_PRIMITIVE] = words[_GEOMETRY] = words[_INSTANCE] = -1
+        if _finite_ray(origins, directions, i):
+            _call3(function, scene, place, 0)
+        far[i] = ray[_FAR]
+        face[i] = words[_PRIMITIVE]
+        u[i] = ray[_U]
+        v[i] = ray[_V]
+
+
+@kernel
+def _occluded_single(function, scene, origins, directions, far, blocked):
+    """One ray per call; Embree marks a blocked ray by a negative infinite reach."""
+    ray = _aligned(_WORDS)
+    words = ray.view(np.int32)
+    place = ray.ctypes.data
+    for i in range(len(origins)):
+        for axis in range(3):
+            ray[_ORIGIN + axis] = origins[i, axis]
+            ray[_DIRECTION + axis] = directions[i, axis]
+        ray[_NEAR] = ray[_TIME] = 0.0
+        ray[_FAR] = far[i]
+        words[_MASK] = -1
+        words[_ID] = words[_FLAGS] = 0
+        if _finite_ray(origins, directions, i):
+            _call3(function, scene, place, 0)
+        blocked[i] = ray[_FAR] < 0.0
+
+
+@inline_kernel
+def _fill_packet(ray, words, valid, origins, directions, far, first, count):
+    """Rays first..first+count into the 16 lanes; lanes that are left over, or hold a ray that is not finite, are switched off."""
+    for lane in range(16):
+        i = first + lane
+        if lane < count and _finite_ray(origins, directions, i):
+            valid[lane] = -1
+            for axis in range(3):
+                ray[(_ORIGIN + axis) * 16 + lane] = origins[i, axis]
+                ray[(_DIRECTION + axis) * 16 + lane] = directions[i, axis]
+            ray[_FAR * 16 + lane] = far[i]
+        else:
+            valid[lane] = 0
+            ray[_FAR * 16 + lane] = 0.0
+        words[_MASK * 16 + lane] = -1
+        words[_PRIMITIVE * 16 + lane] = words[_GEOMETRY * 16 + lane] = words[_INSTANCE * 16 + lane] = -1
+
+
+@kernel
+def _closest_packets(function, scene, origins, directions, far, face, u, v):
+    """Sixteen rays per call: for rays whose neighbours in the list are neighbours in space."""
+    ray, lanes, arguments = _aligned(_WORDS * 16), _aligned(16), _coherent_arguments()
+    words, valid = ray.view(np.int32), lanes.view(np.int32)
+    n = len(origins)
+    for first in range(0, n, 16):
+        count = min(16, n - first)
+        _fill_packet(ray, words, valid, origins, directions, far, first, count)
+        _call4(function, lanes.ctypes.data, scene, ray.ctypes.data, arguments.ctypes.data)
+        for lane in range(count):
+            i = first + lane
+            if valid[lane] != 0:
+                far[i] = ray[_FAR * 16 + lane]
+            face[i] = words[_PRIMITIVE * 16 + lane]
+            u[i] = ray[_U * 16 + lane]
+            v[i] = ray[_V * 16 + lane]
+
+
+@kernel
+def _occluded_packets(function, scene, origins, directions, far, blocked):
+    """Sixteen shadow rays per call."""
+    ray, lanes, arguments = _aligned(_WORDS * 16), _aligned(16), _coherent_arguments()
+    words, valid = ray.view(np.int32), lanes.view(np.int32)
+    n = len(origins)
+    for first in range(0, n, 16):
+        count = min(16, n - first)
+        _fill_packet(ray, words, valid, origins, directions, far, first, count)
+        _call4(function, lanes.ctypes.data, scene, ray.ctypes.data, arguments.ctypes.data)
+        for lane in range(count):
+            blocked[first + lane] = ray[_FAR * 16 + lane] < 0.0
