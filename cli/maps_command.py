@@ -1,0 +1,20 @@
+"""rangecheck maps"""
+
+import click
+
+from .common import Point, common, settings_from
+
+
+@click.command("maps", short_help="Distance, depth, normals and surface IDs from any focal point.")
+@click.argument("scene", type=click.Path())
+@click.option("--camera", type=Point(), metavar="X,Y,Z", help="The focal point, mm; it looks at the middle of the object.")
+@common("out_dir", "unit", "size", "config", "set", "force")
+def command(scene, camera, out, unit, size, config, assignments, force, reporter):
+    """Distance, depth, normals and surface IDs from any focal point.
+
+    DIR gets maps.npz with every map in its unit, coloured pictures with legends, and 16-bit pictures with their scale inside.
+    """
+    from rangecheck.pipeline import maps
+
+    settings = settings_from(config, assignments, picture__width=size and size[0], picture__height=size and size[1])
+    return maps(scene, out, settings=settings, unit=unit, camera_mm=camera, force=force, reporter=reporter)

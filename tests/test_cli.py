@@ -1,0 +1,99 @@
+"""The command line keeps its contract: exit statuses, one clear line on stderr, results on stdout, quick help."""
+
+import importlib
+import json
+import subprocess
+import sys
+
+import click
+import numpy as np
+import pytest
+from rangecheck_cli.main import COMMANDS, exit_status
+
+
+def complaint(capsys, *arguments) -> str:
+    """The one line that a failing command leaves, after checking that its status is 2 and its stdout empty."""
+    assert exit_status([str(a) for a in arguments]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    lines = [line for line in captured.err.splitlines() if line.startswith("rangecheck: ")]
+    assert len(lines) in (1, 2)  # wrong usage adds where to look
+    return lines[0]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_says_in_help_what_the_overview_says(name, capsys):
+    command = importlib.import_module(f"rangecheck_cli.{name}_command").command
+    assert isinstance(command, click.Command)
+    assert command.short_help == COMMANDS[name]
+    assert exit_status([name, "--help"]) == 0
+    assert COMMANDS[name].rstrip(".") in " ".join(capsys.readouterr().out.split())
+
+
+def test_help_imports_no_heavy_package():
+    script = (
+        "import sys, rangecheck_cli.main as m; m.exit_status(['--help']); "
+        "print([n for n in ('numpy', 'numba', 'scipy', 'cv2', 'open3d', 'pydantic', 'rich') if n in sys.modules])"
+    )
+    shown = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    assert shown.splitlines()[-1] == "[]"
+
+
+def test_an_unknown_command_or_option_names_the_nearest(capsys):
+    assert "did you mean render?" in complaint(capsys, "rendr")
+    assert "--frmes" in complaint(capsys, "turntable", "x.ply", "-o", "y.mp4", "--frmes", "3")
+
+
+@pytest.mark.parametrize("command", [["check"], ["mesh", "-o", "out.ply"], ["solid", "-o", "out.stl"], ["render", "-o", "out.png"]])
+def test_a_missing_file_is_one_line_and_status_2(command, capsys, tmp_path):
+    assert "does not exist" in complaint(capsys, *command, tmp_path / "no such file.ply", "--unit", "mm")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_truncated_ply_is_refused(capsys, tmp_path, sample_data):
+    broken = tmp_path / "half a mesh.ply"
+    broken.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 0\n1 0")
+    assert broken.name in complaint(capsys, "check", broken, "--unit", "mm")
+
+
+def test_a_png_that_is_no_png_is_refused(capsys, tmp_path):
+    fake = tmp_path / "depth.png"
+    fake.write_bytes(b"GIF89a, or so")
+    assert "depth.png" in complaint(capsys, "check", fake, "--unit", "mm")
+
+
+def test_a_camera_with_nan_is_refused(capsys, tmp_path, sample_data):
+    manifest = (sample_data / "relief" / "scans.json").read_text().replace('"fx": ', '"fx": NaN, "was": ')
+    (tmp_path / "scans.json").write_text(manifest)
+    assert "NaN" in complaint(capsys, "run", tmp_path / "scans.json", "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_scan_in_which_nothing_returned_is_refused(capsys, tmp_path):
+    from rangecheck.optics import PinholeCamera
+    from rangecheck.scan import RangeScan
+    from rangecheck.scan.readers.npz import write_npz
+
+    camera = PinholeCamera.from_field_of_view(32, 24, 40)
+    write_npz(tmp_path / "nothing.npz", RangeScan(np.full((24, 32), np.nan), camera))
+    assert "0 of 768 cells" in complaint(capsys, "run", tmp_path / "nothing.npz", "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_refused_before_any_work(capsys, tmp_path, sample_data):
+    (tmp_path / "file").write_text("in the way")
+    message = complaint(capsys, "run", sample_data / "bust", "--out", tmp_path / "file" / "out")
+    assert "file" in message
+
+
+def test_a_file_without_unit_asks_for_it(capsys, tmp_path):
+    mesh = tmp_path / "cube.stl"
+    mesh.write_bytes(b"\0" * 80 + np.uint32(1).tobytes() + np.zeros(12, "<f4").tobytes() + b"\0\0")
+    assert "--unit" in complaint(capsys, "check", mesh)
+
+
+def test_json_is_one_document_and_nothing_else(capsys):
+    exit_status(["doctor", "--json", "-q"])
+    document = json.loads(capsys.readouterr().out)
+    assert document["schema"] == "rangecheck/doctor/1"
+    assert {row["name"] for row in document["checks"]} >= {"numpy", "embreex", "encoder"}
