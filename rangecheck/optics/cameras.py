@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -198,16 +199,20 @@ class RayGrid(Camera):
 
         return between(self.origins_mm), unit_vectors(between(self.directions))
 
-    def project(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        # the lateral positions of a linear stage are an affine function of column and row: fit it, then apply its inverse
+    @cached_property
+    def _column_row_of_position(self) -> tuple[FloatArray, FloatArray, float]:
+        # the lateral positions of a linear stage are an affine function of column and row: fit it once, then apply its inverse
         known = np.isfinite(self.origins_mm).all(axis=-1) & np.isfinite(self.directions).all(axis=-1)
         if known.sum() < 3 or np.nanmin(self.directions[..., 2]) < 0.99:
             raise CameraError("this grid of rays is not nearly parallel to its z axis, so points cannot be projected into it")
         rows, columns = np.nonzero(known)
         design = np.stack([columns, rows, np.ones_like(rows)], axis=1).astype(float)
         affine, *_ = np.linalg.lstsq(design, self.origins_mm[known][:, :2], rcond=None)
-        uv = (points_mm[..., :2] - affine[2]) @ np.linalg.inv(affine[:2])
-        return uv, points_mm[..., 2] - float(np.mean(self.origins_mm[known][:, 2]))
+        return np.linalg.inv(affine[:2]), affine[2], float(np.mean(self.origins_mm[known][:, 2]))
+
+    def project(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        inverse, first_mm, start_mm = self._column_row_of_position
+        return (points_mm[..., :2] - first_mm) @ inverse, points_mm[..., 2] - start_mm
 
 
 def distort(x: FloatArray, y: FloatArray, distortion: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
