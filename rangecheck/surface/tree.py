@@ -2,7 +2,8 @@
 
 Faces are split at the median of their centroids along the widest axis, level by level, so that the tree is complete and needs no
 pointers: node i has children 2 i + 1 and 2 i + 2, and leaf k of 2^depth holds the faces k n >> depth to (k + 1) n >> depth of
-`order`. Float64 millimetres about the centre of the surface's box, so that distance from the origin costs no digits.
+`order`. Float64 millimetres about a centre with few binary digits, so that distance from the origin costs no digits and moving
+float32 coordinates to the centre rounds nothing.
 """
 
 from __future__ import annotations
@@ -55,7 +56,8 @@ def _build(surface: Surface) -> TriangleTree:
     if n == 0:
         raise SurfaceError("the surface has no faces; there is nothing to measure against")
     depth = max(0, int(np.ceil(np.log2(n / FACES_PER_LEAF))))
-    centre = surface.bounds_mm.mean(axis=0)
+    step = 2.0 ** (np.floor(np.log2(max(surface.extent_mm, np.finfo(np.float32).tiny))) - 2)
+    centre = np.round(surface.bounds_mm.mean(axis=0) / step) * step
     corners = (surface.vertices - centre)[surface.faces].reshape(n, 9)
     keys = corners[:, 0:3] + corners[:, 3:6] + corners[:, 6:9]
     order = np.arange(n, dtype=np.int32)

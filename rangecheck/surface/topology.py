@@ -1,0 +1,382 @@
+"""How faces hang together. Every predicate returns the culprits; empty means that all is well.
+
+An edge is an unordered pair of vertices; faces that name a vertex twice have no place in the table of edges and are found by
+`degenerate_faces`. Two faces that share an edge belong to one shell; meeting in a vertex alone does not join them. Around a vertex,
+faces joined by edges form a fan; a vertex with two fans is where two sheets touch in a point.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from rangecheck.arrays import FloatArray, IntArray
+from rangecheck.kernels import kernel
+from rangecheck.surface.surface import Surface
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeTable:
+    """The edges of a surface, in ascending order of their vertices.
+
+    ends      (e, 2) int32 vertices, the lower first
+    start     (e + 1,) int32 where the half-edges of each edge begin in `halves`
+    halves    (h,) int32 half-edges 3 face + side, side 0 = ab, 1 = bc, 2 = ca, those of one edge together, by face
+    uses      (e,) int32 faces at each edge
+    along     (e,) int32 of these, the ones that run from the lower vertex to the higher
+    edge_of_half (3m,) int32 edge of each half-edge, -1 for faces that name a vertex twice
+    fans      number of fans, and the fan of each corner (3m,) int32, -1 for faces that name a vertex twice
+    shells    number of shells, and the shell of each face (m,) int32, numbered by their first face
+    """
+
+    faces: IntArray = field(repr=False)
+    ends: IntArray = field(repr=False)
+    start: IntArray = field(repr=False)
+    halves: IntArray = field(repr=False)
+    along: IntArray = field(repr=False)
+    edge_of_half: IntArray = field(repr=False)
+
+    @cached_property
+    def uses(self) -> IntArray:
+        return np.diff(self.start)
+
+    @cached_property
+    def fans(self) -> tuple[int, IntArray]:
+        return joined_corners(self.faces, self.halves, self.start)
+
+    @cached_property
+    def shells(self) -> tuple[int, IntArray]:
+        return joined_faces(len(self.faces), self.halves, self.start)
+
+
+_tables: WeakKeyDictionary[Surface, EdgeTable] = WeakKeyDictionary()
+
+
+def edge_table(surface: Surface) -> EdgeTable:
+    """The edges of `surface`, found once and kept as long as the surface lives; linear in the number of faces."""
+    table = _tables.get(surface)
+    if table is None:
+        halves, low, high = sorted_half_edges(surface.faces, len(surface.vertices))
+        ends, start, along, edge_of_half = grouped_half_edges(surface.faces, halves, low, high)
+        table = _tables[surface] = EdgeTable(surface.faces, ends, start, halves, along, edge_of_half)
+    return table
+
+
+@kernel
+def sorted_half_edges(faces, vertex_count):
+    """Half-edges in ascending order of (lower vertex, higher vertex, face), by counting twice; and these vertices."""
+    total = 0
+    at = np.zeros(vertex_count + 1, np.int64)
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        if a != b and b != c and c != a:
+            total += 3
+            at[max(a, b) + 1] += 1
+            at[max(b, c) + 1] += 1
+            at[max(c, a) + 1] += 1
+    for v in range(vertex_count):
+        at[v + 1] += at[v]
+    by_high = np.empty(total, np.int32)
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        if a != b and b != c and c != a:
+            for side in range(3):
+                p, q = faces[f, side], faces[f, (side + 1) % 3]
+                v = max(p, q)
+                by_high[at[v]] = 3 * f + side
+                at[v] += 1
+    at[:] = 0
+    for i in range(total):
+        f, side = by_high[i] // 3, by_high[i] % 3
+        at[min(faces[f, side], faces[f, (side + 1) % 3]) + 1] += 1
+    for v in range(vertex_count):
+        at[v + 1] += at[v]
+    halves, low, high = np.empty(total, np.int32), np.empty(total, np.int32), np.empty(total, np.int32)
+    for i in range(total):
+        f, side = by_high[i] // 3, by_high[i] % 3
+        p, q = faces[f, side], faces[f, (side + 1) % 3]
+        v = min(p, q)
+        halves[at[v]], low[at[v]], high[at[v]] = by_high[i], v, max(p, q)
+        at[v] += 1
+    return halves, low, high
+
+
+@kernel
+def grouped_half_edges(faces, halves, low, high):
+    """Ends, starts and direction counts of the edges whose sorted half-edges are given, and the edge of each half-edge."""
+    count = 0
+    for i in range(len(halves)):
+        if i == 0 or low[i] != low[i - 1] or high[i] != high[i - 1]:
+            count += 1
+    ends, start, along = np.empty((count, 2), np.int32), np.empty(count + 1, np.int32), np.zeros(count, np.int32)
+    edge_of_half = np.full(3 * len(faces), -1, np.int32)
+    edge = -1
+    for i in range(len(halves)):
+        if i == 0 or low[i] != low[i - 1] or high[i] != high[i - 1]:
+            edge += 1
+            ends[edge, 0], ends[edge, 1], start[edge] = low[i], high[i], i
+        edge_of_half[halves[i]] = edge
+        if faces[halves[i] // 3, halves[i] % 3] == low[i]:
+            along[edge] += 1
+    start[count] = len(halves)
+    return ends, start, along, edge_of_half
+
+
+def boundary_edges(surface: Surface) -> IntArray:
+    """(k, 2) edges with one face, in that face's direction."""
+    table = edge_table(surface)
+    half = table.halves[table.start[:-1][table.uses == 1]]
+    face, side = half // 3, half % 3
+    return np.stack([surface.faces[face, side], surface.faces[face, (side + 1) % 3]], axis=1).astype(np.int32)
+
+
+def non_manifold_edges(surface: Surface) -> IntArray:
+    """(k, 2) edges with more than two faces."""
+    table = edge_table(surface)
+    return table.ends[table.uses > 2]
+
+
+def inconsistent_edges(surface: Surface) -> IntArray:
+    """(k, 2) edges whose two faces run the same way along them: one of the two is turned over."""
+    table = edge_table(surface)
+    return table.ends[(table.uses == 2) & (table.along != 1)]
+
+
+def unreferenced_vertices(surface: Surface) -> IntArray:
+    """(k,) vertices that no face names."""
+    used = np.zeros(len(surface.vertices), bool)
+    used[surface.faces.ravel()] = True
+    return np.flatnonzero(~used)
+
+
+def degenerate_faces(surface: Surface) -> IntArray:
+    """(k,) faces that name a vertex twice, or whose three corners are in line to the rounding of their coordinates."""
+    return np.flatnonzero(faces_without_area(surface.vertices, surface.faces))
+
+
+@kernel
+def faces_without_area(vertices, faces):
+    """(m,) whether twice a face's area is within rounding (2^-50 of its two sides' product) of 0."""
+    without = np.empty(len(faces), np.bool_)
+    for f in range(len(faces)):
+        a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
+        ux, uy, uz, vx, vy, vz = b[0] - a[0], b[1] - a[1], b[2] - a[2], c[0] - a[0], c[1] - a[1], c[2] - a[2]
+        x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        bound = (ux * ux + uy * uy + uz * uz) * (vx * vx + vy * vy + vz * vz) * 2.0**-100
+        without[f] = x * x + y * y + z * z <= bound
+    return without
+
+
+def duplicate_faces(surface: Surface) -> IntArray:
+    """(k,) faces that name the same three vertices as an earlier face, whichever way round."""
+    table = edge_table(surface)
+    return np.flatnonzero(repeated_faces(surface.faces, table.halves, table.start))
+
+
+@kernel
+def repeated_faces(faces, halves, start):
+    """(m,) whether a face has the same corners as an earlier one: then both lie at one edge with the same far corner."""
+    repeated = np.zeros(len(faces), np.bool_)
+    for edge in range(len(start) - 1):
+        for i in range(start[edge] + 1, start[edge + 1]):
+            far = faces[halves[i] // 3, (halves[i] % 3 + 2) % 3]
+            for j in range(start[edge], i):
+                if faces[halves[j] // 3, (halves[j] % 3 + 2) % 3] == far:
+                    repeated[max(halves[i] // 3, halves[j] // 3)] = True
+    return repeated
+
+
+@kernel
+def _root(parent, i):
+    while parent[i] != i:
+        parent[i] = parent[parent[i]]
+        i = parent[i]
+    return i
+
+
+@kernel
+def _join(parent, i, j):
+    i, j = _root(parent, i), _root(parent, j)
+    parent[max(i, j)] = min(i, j)
+
+
+@kernel
+def _numbered(parent):
+    """Number of sets, and the set of each member; a set's root is its lowest member, so it is numbered before the others."""
+    number, count = np.empty(len(parent), np.int32), 0
+    for i in range(len(parent)):
+        if parent[i] < 0:
+            number[i] = -1
+        elif parent[i] == i:
+            number[i] = count
+            count += 1
+        else:
+            number[i] = number[_root(parent, i)]
+    return count, number
+
+
+@kernel
+def joined_corners(faces, halves, start):
+    """Number of fans and the fan of each corner (3m,), numbered by their first corner; -1 for faces without edges in the table."""
+    parent = np.full(3 * len(faces), -1, np.int32)
+    for i in range(len(halves)):
+        parent[halves[i]] = halves[i]
+    for edge in range(len(start) - 1):
+        first = halves[start[edge]]
+        f, side = first // 3, first % 3
+        for i in range(start[edge] + 1, start[edge + 1]):
+            g, other = halves[i] // 3, halves[i] % 3
+            here, there = 3 * g + other, 3 * g + (other + 1) % 3
+            if faces[g, other] != faces[f, side]:
+                here, there = there, here
+            _join(parent, 3 * f + side, here)
+            _join(parent, 3 * f + (side + 1) % 3, there)
+    return _numbered(parent)
+
+
+def non_manifold_vertices(surface: Surface) -> IntArray:
+    """(k,) vertices whose faces form more than one fan: sheets that touch in a point."""
+    return np.flatnonzero(_fans_of_vertices(surface) > 1)
+
+
+def _fans_of_vertices(surface: Surface) -> IntArray:
+    """(n,) number of fans at each vertex."""
+    count, fan = edge_table(surface).fans
+    vertex_of_fan = np.empty(count, np.int32)
+    present = fan >= 0
+    vertex_of_fan[fan[present]] = surface.faces.ravel()[present]
+    return np.bincount(vertex_of_fan, minlength=len(surface.vertices))
+
+
+def shells(surface: Surface) -> tuple[int, IntArray]:
+    """Number of shells, and the shell of each face (m,) int32, numbered by their first face."""
+    return edge_table(surface).shells
+
+
+@kernel
+def joined_faces(face_count, halves, start):
+    """Number of shells and the shell of each face (m,), numbered by their first face."""
+    parent = np.arange(face_count).astype(np.int32)
+    for edge in range(len(start) - 1):
+        for i in range(start[edge] + 1, start[edge + 1]):
+            _join(parent, halves[start[edge]] // 3, halves[i] // 3)
+    return _numbered(parent)
+
+
+def euler_numbers(surface: Surface) -> IntArray:
+    """(shells,) fans - edges + faces of each shell: 2 - 2 genus where it is closed, less one for each hole."""
+    count, shell = shells(surface)
+    table = edge_table(surface)
+    fan_count, fan = table.fans
+    present = fan >= 0
+    fan_shell = np.zeros(fan_count, np.int32)
+    fan_shell[fan[present]] = np.repeat(shell, 3)[present]
+    edge_shell = shell[table.halves[table.start[:-1]] // 3]
+    with_edges = present.reshape(-1, 3).all(axis=1)
+    return (
+        np.bincount(fan_shell, minlength=count)
+        - np.bincount(edge_shell, minlength=count)
+        + np.bincount(shell[with_edges], minlength=count)
+    )
+
+
+def boundary_loops(surface: Surface) -> list[IntArray]:
+    """Open borders as rings of vertices, each (k,) int32 in the direction of its faces, the one with most edges first.
+
+    At a vertex where several borders meet, each continues around the fan it came along; a ring that comes back to a vertex is parted
+    there, so that holes which touch in a point stay two. Where a border runs into an edge with more than two faces, pieces are joined
+    at their ends as they come."""
+    table = edge_table(surface)
+    half = table.halves[table.start[:-1][table.uses == 1]]
+    if not len(half):
+        return []
+    ring, start = chained_borders(surface.faces, table.halves, table.start, table.edge_of_half, half, len(surface.vertices))
+    rings = [simple for a, b in pairwise(start) for simple in _simple_rings(ring[a:b])]
+    return sorted(rings, key=lambda r: (-len(r), tuple(r[:3].tolist())))
+
+
+def _simple_rings(ring: IntArray) -> list[IntArray]:
+    """`ring` parted wherever it comes back to a vertex."""
+    if len(np.unique(ring)) == len(ring):
+        return [ring]
+    rings: list[IntArray] = []
+    path: list[int] = []
+    place: dict[int, int] = {}
+    for vertex in ring.tolist():
+        if vertex in place:
+            first = place[vertex]
+            rings.append(np.array(path[first:], np.int32))
+            for left in path[first:]:
+                del place[left]
+            del path[first:]
+        place[vertex] = len(path)
+        path.append(vertex)
+    return [*rings, np.array(path, np.int32)]
+
+
+@kernel
+def _border_after(faces, halves, start, edge_of_half, half):
+    """The border half-edge reached by turning around the end vertex of border half-edge `half`; -1 where the fan is not clean."""
+    f, side = half // 3, half % 3
+    pivot = faces[f, (side + 1) % 3]
+    for _ in range(3 * len(faces)):
+        # leave face f over its other edge at the pivot
+        for turn in range(1, 3):
+            other = (side + turn) % 3
+            if faces[f, other] == pivot or faces[f, (other + 1) % 3] == pivot:
+                break
+        edge = edge_of_half[3 * f + other]
+        uses = start[edge + 1] - start[edge]
+        if uses == 1:
+            return 3 * f + other
+        if uses > 2:
+            return -1
+        across = halves[start[edge]] + halves[start[edge] + 1] - (3 * f + other)
+        f, side = across // 3, across % 3
+    return -1
+
+
+@kernel
+def chained_borders(faces, halves, start, edge_of_half, border, vertex_count):
+    """Vertices of all border rings one after another, and where each begins. `border` are the half-edges with one face."""
+    ring, starts = np.empty(len(border), np.int32), np.empty(len(border) + 1, np.int32)
+    done = np.zeros(3 * len(faces), np.bool_)
+    leaving = np.full(vertex_count, -1, np.int32)
+    for h in border:
+        leaving[faces[h // 3, h % 3]] = h
+    count, rings = 0, 0
+    starts[0] = 0
+    for first in border:
+        if done[first]:
+            continue
+        h = first
+        while h >= 0 and not done[h]:
+            done[h] = True
+            ring[count] = faces[h // 3, h % 3]
+            count += 1
+            end = faces[h // 3, (h % 3 + 1) % 3]
+            following = _border_after(faces, halves, start, edge_of_half, h)
+            if following < 0 or faces[following // 3, following % 3] != end:
+                following = leaving[end]
+            h = following
+        rings += 1
+        starts[rings] = count
+    return ring, starts[: rings + 1]
+
+
+def loop_lengths_mm(surface: Surface, loops: list[IntArray]) -> FloatArray:
+    """(len(loops),) length of each ring of vertices."""
+    return np.array(
+        [float(np.linalg.norm(surface.vertices[np.roll(r, -1)] - surface.vertices[r], axis=1).sum()) for r in loops], np.float64
+    )
+
+
+def is_closed(surface: Surface) -> bool:
+    """Whether every edge has exactly two faces, which run opposite ways along it, and no face names a vertex twice."""
+    table = edge_table(surface)
+    whole = len(surface.faces) > 0 and len(table.halves) == 3 * len(surface.faces)
+    return whole and bool((table.uses == 2).all() and (table.along == 1).all())
