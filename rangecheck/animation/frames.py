@@ -1,0 +1,169 @@
+"""Frames as files that can be interrupted anywhere and taken up again with the same bytes.
+
+A folder holds the frames of one job only. Its manifest, frames.json, states the job's key - a hash of everything that determines
+the pictures - the exposure that all of them share, and the hash of each finished frame. A frame counts as finished when its file
+has that hash; anything else is made again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rangecheck.arrays import FloatArray
+from rangecheck.errors import InputError, OutputError
+from rangecheck.files import read_json, sha256, write_bytes, write_json
+
+MANIFEST = "frames.json"
+SCHEMA = "rangecheck/frames/1"
+#: frames that are looked at to choose the exposure, evenly spread over the sequence
+PILOTS = 4
+
+
+def key_of(determinants: Mapping[str, Any]) -> str:
+    """Hex key of everything that determines a job's frames: JSON values, arrays, bytes, and nests of them, by name."""
+    digest = hashlib.sha256()
+
+    def feed(value: Any) -> None:
+        if isinstance(value, Mapping):
+            digest.update(b"{%d" % len(value))
+            for name in sorted(value, key=str):
+                feed(str(name))
+                feed(value[name])
+        elif isinstance(value, np.ndarray):
+            digest.update(f"a{value.dtype.str}{value.shape}".encode())
+            digest.update(np.ascontiguousarray(value).tobytes())
+        elif isinstance(value, bytes):
+            digest.update(b"b%d:" % len(value) + value)
+        elif isinstance(value, (list, tuple)):
+            digest.update(b"[%d" % len(value))
+            for item in value:
+                feed(item)
+        elif isinstance(value, np.generic):
+            feed(value.item())
+        else:
+            text = json.dumps(value)
+            digest.update(f"{type(value).__name__}{len(text)}:{text}".encode())
+
+    feed(determinants)
+    return digest.hexdigest()
+
+
+def pilot_indices(frames: int, pilots: int = PILOTS) -> list[int]:
+    """The frames an exposure is taken from: `pilots` of them (or all), evenly spread, the same for every run."""
+    count = min(frames, pilots)
+    return [k * frames // count for k in range(count)]
+
+
+def frame_name(index: int, frames: int, suffix: str = ".png") -> str:
+    """frame_0007.png: numbers padded so that names sort as they play."""
+    return f"frame_{index:0{max(4, len(str(frames - 1)))}d}{suffix}"
+
+
+def render_frames(
+    frame: Callable[[int], FloatArray],
+    frames: int,
+    folder: str | Path,
+    key: str | Mapping[str, Any],
+    *,
+    encode: Callable[[FloatArray, float], bytes],
+    exposure: Callable[[Sequence[FloatArray]], float] | float = 1.0,
+    suffix: str = ".png",
+    force: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Path]:
+    """Make frames 0..frames-1 as files in `folder`, or those of them that are missing, and return their paths in order.
+
+    frame(index) is the radiance of one frame, a pure function of its number; encode(radiance, exposure) is its file. `exposure`
+    is a number, or a function of the pilot frames' radiances, asked once before the first frame is written and then kept in the
+    manifest. progress(done, frames) is called after each frame. An interruption leaves only whole files, and the next call with
+    the same key goes on to the same bytes.
+
+    Raises OutputError when the folder holds frames of another job, or frames without a manifest, unless `force`, which removes
+    them first."""
+    where = Path(folder)
+    job = key if isinstance(key, str) else key_of(key)
+    manifest = _taken_up(where, job, frames, suffix, force)
+    paths = [where / frame_name(i, frames, suffix) for i in range(frames)]
+    done: dict[str, str] = manifest["done"]
+    missing = [i for i, path in enumerate(paths) if not _finished(path, done.get(path.name))]
+    if progress is not None:
+        progress(frames - len(missing), frames)
+    kept: dict[int, FloatArray] = {}
+    if missing and manifest["exposure"] is None:
+        if callable(exposure):
+            kept = {i: frame(i) for i in pilot_indices(frames)}
+            manifest["exposure"] = float(exposure(list(kept.values())))
+        else:
+            manifest["exposure"] = float(exposure)
+    level = manifest["exposure"]
+
+    def write(index: int, radiance: FloatArray) -> None:
+        content = encode(radiance, level)
+        write_bytes(paths[index], content)
+        done[paths[index].name] = hashlib.sha256(content).hexdigest()
+        write_json(where / MANIFEST, manifest)
+
+    # while one frame is traced the last one is encoded; one writer keeps the manifest in order
+    with ThreadPoolExecutor(1, thread_name_prefix="frame-writer") as writer:
+        writing: Future[None] | None = None
+        for count, index in enumerate(missing):
+            radiance = kept.pop(index) if index in kept else frame(index)
+            if writing is not None:
+                writing.result()
+                if progress is not None:
+                    progress(frames - len(missing) + count, frames)
+            writing = writer.submit(write, index, radiance)
+        if writing is not None:
+            writing.result()
+            if progress is not None:
+                progress(frames, frames)
+    return paths
+
+
+def _finished(path: Path, expected: str | None) -> bool:
+    return expected is not None and path.is_file() and sha256(path) == expected
+
+
+def _taken_up(where: Path, job: str, frames: int, suffix: str, force: bool) -> dict[str, Any]:
+    """The folder's manifest if it is this job's, else a new one in a folder without frames."""
+    fresh = {"schema": SCHEMA, "key": job, "frames": frames, "suffix": suffix, "exposure": None, "done": {}}
+    try:
+        where.mkdir(parents=True, exist_ok=True)
+        present = sorted(where.glob("frame_*"))
+        for part in where.glob(".frame*.part*"):
+            part.unlink(missing_ok=True)
+    except OSError as error:
+        raise OutputError(where, f"cannot be used for frames ({error.strerror}); choose a folder you may write to") from None
+    manifest: Any = None
+    if (where / MANIFEST).exists():
+        with suppress(InputError):
+            manifest = read_json(where / MANIFEST)
+    if _is_ours(manifest, fresh):
+        return manifest
+    if (present or manifest is not None) and not force:
+        other = manifest.get("key") if isinstance(manifest, dict) else None
+        whose = f"frames of another job (key {str(other)[:12]}, this one is {job[:12]})" if other else "frames of an unknown job"
+        raise OutputError(
+            where, f"holds {len(present)} {whose}; pass --force to replace them, or choose another folder", count=len(present)
+        )
+    for path in present:
+        path.unlink(missing_ok=True)
+    write_json(where / MANIFEST, fresh)
+    return fresh
+
+
+def _is_ours(manifest: Any, fresh: dict[str, Any]) -> bool:
+    return (
+        isinstance(manifest, dict)
+        and all(manifest.get(name) == fresh[name] for name in ("schema", "key", "frames", "suffix"))
+        and isinstance(manifest.get("done"), dict)
+        and (manifest.get("exposure") is None or (isinstance(manifest["exposure"], float) and manifest["exposure"] > 0))
+    )
