@@ -62,7 +62,7 @@ def require(
 
 def unit_vectors(vectors: FloatArray) -> FloatArray:
     """`vectors` (..., 3) divided by their lengths; a zero vector becomes NaN."""
-    length = np.sqrt((vectors * vectors).sum(axis=-1, keepdims=True))
+    length = np.sqrt(np.einsum("...i,...i->...", vectors, vectors))[..., None]
     with np.errstate(invalid="ignore", divide="ignore"):
         return vectors / length
 

@@ -6,6 +6,7 @@ its component along the optical axis: two maps, two names. Where nothing is hit,
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -17,7 +18,7 @@ from rangecheck.kernels import in_chunks, kernel
 from rangecheck.maps.inside import require_outside
 from rangecheck.optics import Camera
 from rangecheck.raycast import EmbreeCaster, Hits
-from rangecheck.rigid import checked, move_directions, move_points
+from rangecheck.rigid import checked, move_points
 from rangecheck.surface import Surface
 
 PIXELS_PER_CHUNK = 16384
@@ -64,55 +65,63 @@ class Maps:
 
 
 @kernel
-def refine_hits(origins_mm, directions, vertices_mm, faces, face, distance_mm):
-    """Distances of float32 hits made again in float64, against the plane of the face that was hit (in place).
+def rays_to_world(world_from_camera, origins, directions, world_origins, world_directions):
+    """Camera-frame rays in the world frame; one pass instead of numpy's many."""
+    m = world_from_camera
+    for i in range(origins.shape[0]):
+        x, y, z = origins[i]
+        dx, dy, dz = directions[i]
+        for axis in range(3):
+            world_origins[i, axis] = m[axis, 0] * x + m[axis, 1] * y + m[axis, 2] * z + m[axis, 3]
+            world_directions[i, axis] = m[axis, 0] * dx + m[axis, 1] * dy + m[axis, 2] * dz
 
-    Where the ray meets that plane outside the face - the engine's rounding chose a neighbour across an edge, which matters on
+
+@kernel
+def measure_hits(origins_mm, directions, vertices_mm, faces, face, distance_mm, normals, incidence_rad):
+    """Distance (in place), normal and incidence of the faces that float32 rays hit, in float64.
+
+    Where a ray meets its face's plane outside the face - the engine's rounding chose a neighbour across an edge, which matters on
     faces seen edge-on - the distance is that of the face's point nearest to the plane's hit, so that no point lies off the surface
     by more than the engine's sideways rounding."""
     for i in range(face.shape[0]):
         f = face[i]
         if f < 0:
-            distance_mm[i] = np.nan
+            distance_mm[i], incidence_rad[i] = np.nan, np.nan
+            normals[i, :] = np.nan
             continue
-        a, b, c = vertices_mm[faces[f, 0]], vertices_mm[faces[f, 1]], vertices_mm[faces[f, 2]]
-        o, d = origins_mm[i], directions[i]
-        e1x, e1y, e1z = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-        e2x, e2y, e2z = c[0] - a[0], c[1] - a[1], c[2] - a[2]
-        px, py, pz = d[1] * e2z - d[2] * e2y, d[2] * e2x - d[0] * e2z, d[0] * e2y - d[1] * e2x
-        determinant = e1x * px + e1y * py + e1z * pz
-        if determinant == 0.0:
+        ia, ib, ic = faces[f, 0], faces[f, 1], faces[f, 2]
+        ax, ay, az = vertices_mm[ia, 0], vertices_mm[ia, 1], vertices_mm[ia, 2]
+        e1x, e1y, e1z = vertices_mm[ib, 0] - ax, vertices_mm[ib, 1] - ay, vertices_mm[ib, 2] - az
+        e2x, e2y, e2z = vertices_mm[ic, 0] - ax, vertices_mm[ic, 1] - ay, vertices_mm[ic, 2] - az
+        dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
+        nx, ny, nz = e1y * e2z - e1z * e2y, e1z * e2x - e1x * e2z, e1x * e2y - e1y * e2x
+        length = math.sqrt(nx * nx + ny * ny + nz * nz)
+        normals[i, 0], normals[i, 1], normals[i, 2] = nx / length, ny / length, nz / length
+        cx, cy, cz = ny * dz - nz * dy, nz * dx - nx * dz, nx * dy - ny * dx
+        across = nx * dx + ny * dy + nz * dz
+        incidence_rad[i] = math.atan2(math.sqrt(cx * cx + cy * cy + cz * cz), -across)
+        if across == 0.0:
             continue
-        sx, sy, sz = o[0] - a[0], o[1] - a[1], o[2] - a[2]
-        u = (sx * px + sy * py + sz * pz) / determinant
+        sx, sy, sz = origins_mm[i, 0] - ax, origins_mm[i, 1] - ay, origins_mm[i, 2] - az
         qx, qy, qz = sy * e1z - sz * e1y, sz * e1x - sx * e1z, sx * e1y - sy * e1x
-        v = (d[0] * qx + d[1] * qy + d[2] * qz) / determinant
+        # Moller & Trumbore's determinant is minus the component across the face
+        u = -(sx * (dy * e2z - dz * e2y) + sy * (dz * e2x - dx * e2z) + sz * (dx * e2y - dy * e2x)) / across
+        v = -(dx * qx + dy * qy + dz * qz) / across
         if u >= 0.0 and v >= 0.0 and u + v <= 1.0:
-            distance_mm[i] = (e2x * qx + e2y * qy + e2z * qz) / determinant
+            distance_mm[i] = -(e2x * qx + e2y * qy + e2z * qz) / across
         else:
             u, v = max(u, 0.0), max(v, 0.0)
             if u + v > 1.0:
                 u, v = u / (u + v), v / (u + v)
             x, y, z = u * e1x + v * e2x - sx, u * e1y + v * e2y - sy, u * e1z + v * e2z - sz
-            distance_mm[i] = x * d[0] + y * d[1] + z * d[2]
+            distance_mm[i] = x * dx + y * dy + z * dz
 
 
-def first_hits(surface: Surface, caster: Caster, origins_mm: FloatArray, directions: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Distance (n,) float64, NaN where missed, and face (n,) int32 of rays in the world frame; one chunk, no threads.
-
-    Rays start for the engine where they enter the ball around the surface, so that a far camera costs no precision."""
-    low, high = surface.bounds_mm
-    centre = 0.5 * (low + high)
-    radius = 0.5 * float(np.linalg.norm(high - low)) * (1 + 1e-6)
-    local = origins_mm - centre
-    along = -(local * directions).sum(axis=1)
-    closest = local + along[:, None] * directions
-    half_chord = np.sqrt(np.maximum(radius * radius - (closest * closest).sum(axis=1), 0.0))
-    advance = np.maximum(along - half_chord, 0.0)
-    hits = caster.closest(origins_mm + advance[:, None] * directions, directions)
-    distance = hits.distance_mm + advance
-    refine_hits(origins_mm, directions, surface.vertices, surface.faces, hits.face, distance)
-    return distance, hits.face
+def closest_of_picture(caster: Caster, origins_mm: FloatArray, directions: FloatArray) -> Hits:
+    """First hits of rays that lie side by side in a picture."""
+    if isinstance(caster, EmbreeCaster):
+        return caster.closest(origins_mm, directions, coherent=True)
+    return caster.closest(origins_mm, directions)
 
 
 def trace_maps(
@@ -137,21 +146,26 @@ def trace_maps(
     distance, depth = np.empty(n), np.empty(n)
     normals, incidence = np.empty((n, 3), np.float32), np.empty(n, np.float32)
     face = np.empty(n, np.int32)
-    face_normals = surface.face_normals
 
     def chunk(start: int, stop: int) -> None:
+        here = slice(start, stop)
         pixel = np.arange(start, stop)
         origins, directions = camera.rays((pixel % w).astype(float), (pixel // w).astype(float))
-        axial = directions[:, 2]
-        world_origins, world_directions = move_points(pose, origins), move_directions(pose, directions)
-        t, f = first_hits(surface, engine, world_origins, world_directions)
-        seen = f >= 0
-        normal = np.where(seen[:, None], face_normals[f], np.nan)
-        cosine = -(normal * world_directions).sum(axis=1)
-        sine = np.sqrt((np.cross(normal, world_directions) ** 2).sum(axis=1))
-        distance[start:stop], face[start:stop] = t, f
-        depth[start:stop] = origins[:, 2] + t * axial
-        normals[start:stop], incidence[start:stop] = normal, np.arctan2(sine, cosine)
+        world_origins, world_directions = np.empty((stop - start, 3)), np.empty((stop - start, 3))
+        rays_to_world(pose, origins, directions, world_origins, world_directions)
+        hits = closest_of_picture(engine, world_origins, world_directions)
+        distance[here], face[here] = hits.distance_mm, hits.face
+        measure_hits(
+            world_origins,
+            world_directions,
+            surface.vertices,
+            surface.faces,
+            face[here],
+            distance[here],
+            normals[here],
+            incidence[here],
+        )
+        depth[here] = origins[:, 2] + distance[here] * directions[:, 2]
 
     in_chunks(chunk, n, PIXELS_PER_CHUNK)
     part = np.where(face >= 0, surface.part_of_face[face] + 1, 0).astype(np.int32)
