@@ -107,7 +107,7 @@ def test_a_wrong_setting_is_refused_with_its_path(assignment, message):
 def test_presets_load_and_single_options_win():
     settings = load_settings("quick", ["turntable.frames=5"], {"turntable.frames": 7, "seed": None})
     assert (settings.turntable.frames, settings.picture.width, settings.seed) == (7, 256, 0)
-    for preset in files.presets_folder().glob("*.toml"):
+    for preset in (files.presets_folder() / "jobs").glob("*.toml"):
         load_settings(preset)
     json.dumps(load_settings("fine").model_dump(mode="json"), allow_nan=False)
 

@@ -20,7 +20,7 @@ def load_settings(
 ) -> Settings:
     """Resolved settings.
 
-    file         a TOML file, or the name of a preset in configs/ (quick, normal, fine)
+    file         a TOML file, or the name of a preset in configs/jobs/ (quick, normal, fine)
     assignments  "section.key=value" with TOML values; a bare word is a string
     overrides    {"section.key": value}; None values are skipped
 
@@ -43,9 +43,9 @@ def load_settings(
 def _read(file: str | Path) -> dict[str, Any]:
     path = Path(file)
     if path.suffix != ".toml" and not path.exists():
-        preset = presets_folder() / f"{file}.toml"
+        preset = presets_folder() / "jobs" / f"{file}.toml"
         if not preset.is_file():
-            known = ", ".join(sorted(p.stem for p in presets_folder().glob("*.toml")))
+            known = ", ".join(sorted(p.stem for p in (presets_folder() / "jobs").glob("*.toml")))
             raise InputError(file, f"is neither a TOML file nor a preset; presets are {known}")
         path = preset
     try:

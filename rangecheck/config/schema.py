@@ -79,7 +79,7 @@ class Checking(Section):
     max_invented_percent: Annotated[float, Field(ge=0, le=100)] = Field(
         25.0, description="share of the surface above the base that may be invented before the scans are called unfit"
     )
-    severities: dict[str, Literal["ignore", "note", "warning", "error"]] = Field(
+    severities: dict[str, Literal["note", "warning", "error"]] = Field(
         default_factory=dict, description="overrides by finding code"
     )
 
