@@ -44,9 +44,11 @@ def checked(motion: npt.ArrayLike, name: str = "motion") -> FloatArray:
             name=name,
             departure=departure,
         )
-    u, _, vt = np.linalg.svd(rotation)
     result = np.eye(4)
-    result[:3, :3] = u @ vt
+    result[:3, :3] = rotation
+    if departure > 16 * np.finfo(np.float64).eps:  # what is orthonormal to rounding keeps its bits, so that files round-trip
+        u, _, vt = np.linalg.svd(rotation)
+        result[:3, :3] = u @ vt
     result[:3, 3] = matrix[:3, 3]
     return result
 

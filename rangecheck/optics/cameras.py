@@ -17,6 +17,7 @@ import numpy as np
 
 from rangecheck.arrays import FloatArray, require, unit_vectors
 from rangecheck.errors import CameraError
+from rangecheck.optics.ray_law import RayLaw, fit_law
 
 
 @dataclass(frozen=True)
@@ -173,8 +174,10 @@ class CylindricalCamera(Camera):
 class RayGrid(Camera):
     """Any other grid of rays, as measured: unit `directions` and `origins_mm`, both (height, width, 3), camera frame.
 
-    Cells whose ray is not known hold NaN. Between cells rays are interpolated; `project` needs nearly parallel rays along
-    +z, as light-stripe scanners on a linear stage have."""
+    Cells whose ray is not known hold NaN. Between cells rays are interpolated, and `project` inverts exactly that interpolation
+    (to 1e-4 cells; NaN where neighbouring rays cross); in cells without a ray it follows the law of the others. It needs rays that
+    all run forward along z, as of light-stripe scanners and cameras, or that start in one point, as of scanners that turn.
+    Other scanners' views can be read, but points cannot be projected into them."""
 
     origins_mm: FloatArray = field(repr=False)
     directions: FloatArray = field(repr=False)
@@ -200,19 +203,14 @@ class RayGrid(Camera):
         return between(self.origins_mm), unit_vectors(between(self.directions))
 
     @cached_property
-    def _column_row_of_position(self) -> tuple[FloatArray, FloatArray, float]:
-        # the lateral positions of a linear stage are an affine function of column and row: fit it once, then apply its inverse
-        known = np.isfinite(self.origins_mm).all(axis=-1) & np.isfinite(self.directions).all(axis=-1)
-        if known.sum() < 3 or np.nanmin(self.directions[..., 2]) < 0.99:
-            raise CameraError("this grid of rays is not nearly parallel to its z axis, so points cannot be projected into it")
-        rows, columns = np.nonzero(known)
-        design = np.stack([columns, rows, np.ones_like(rows)], axis=1).astype(float)
-        affine, *_ = np.linalg.lstsq(design, self.origins_mm[known][:, :2], rcond=None)
-        return np.linalg.inv(affine[:2]), affine[2], float(np.mean(self.origins_mm[known][:, 2]))
+    def law(self) -> RayLaw:
+        """The closed-form law that the rays nearly follow (`law.a`, `law.s`, `law.start_mm`), with what each cell leaves over.
+
+        Raises CameraError when the rays neither all run forward along z nor start in one point."""
+        return fit_law(self.origins_mm, self.directions)
 
     def project(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        inverse, first_mm, start_mm = self._column_row_of_position
-        return (points_mm[..., :2] - first_mm) @ inverse, points_mm[..., 2] - start_mm
+        return self.law.project(points_mm)
 
 
 def distort(x: FloatArray, y: FloatArray, distortion: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:

@@ -10,7 +10,7 @@ from rangecheck.arrays import mm_per
 from rangecheck.errors import InputError
 from rangecheck.files import read_bytes
 from rangecheck.scan.range_scan import RangeScan
-from rangecheck.scan.readers import depth_png, manifest
+from rangecheck.scan.readers import conf, depth_png, manifest, npz, ply, range_grid_ply
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,9 @@ class Format:
 FORMATS = (
     Format("depth PNG", (".png",), (depth_png.SIGNATURE,), manifest.read_lone_picture),
     Format("manifest", (".json",), (), manifest.read_manifest),
+    Format("NumPy archive", (".npz",), (npz.MAGIC,), npz.read_npz),
+    Format("PLY", (".ply",), (ply.MAGIC,), range_grid_ply.read_range_grid),
+    Format("placement list", (".conf",), (), conf.read_conf),
 )
 
 
