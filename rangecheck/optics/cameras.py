@@ -17,6 +17,7 @@ import numpy as np
 
 from rangecheck.arrays import FloatArray, require, unit_vectors
 from rangecheck.errors import CameraError
+from rangecheck.optics.distortion import distort, largest_shift, undistort
 from rangecheck.optics.ray_law import RayLaw, fit_law
 
 
@@ -88,6 +89,15 @@ class PinholeCamera(Camera):
     def matrix(self) -> FloatArray:
         """(3, 3) K."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
+
+    def distortion_px(self) -> float:
+        """How many pixels distortion moves the worst of 33 x 33 points of the frame; inf where a pixel has no ray."""
+        if not any(self.distortion):
+            return 0.0
+        u, v = np.linspace(-0.5, self.width - 0.5, 33), np.linspace(-0.5, self.height - 0.5, 33)
+        us, vs = np.meshgrid(u, v)
+        shift = largest_shift((us - self.cx) / self.fx, (vs - self.cy) / self.fy, self.distortion)
+        return shift * max(self.fx, self.fy)
 
     def rays(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
         x, y = (np.asarray(u) - self.cx) / self.fx, (np.asarray(v) - self.cy) / self.fy
@@ -211,37 +221,6 @@ class RayGrid(Camera):
 
     def project(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
         return self.law.project(points_mm)
-
-
-def distort(x: FloatArray, y: FloatArray, distortion: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
-    """Distorted normalised coordinates of undistorted ones (Brown-Conrady, OpenCV's order)."""
-    k1, k2, p1, p2, k3, k4, k5, k6 = (*distortion, *([0.0] * (8 - len(distortion))))
-    r2 = x * x + y * y
-    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-    xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-    return xd, yd
-
-
-def undistort(x: FloatArray, y: FloatArray, distortion: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
-    """Inverse of `distort` by Newton's method with the numerical Jacobian; NaN where the lens model folds over."""
-    xu, yu = np.array(x, dtype=float), np.array(y, dtype=float)
-    step = 1e-6
-    for _ in range(20):
-        xd, yd = distort(xu, yu, distortion)
-        ex, ey = xd - x, yd - y
-        xa, ya = distort(xu + step, yu, distortion)
-        xb, yb = distort(xu, yu + step, distortion)
-        a, b, c, d = (xa - xd) / step, (xb - xd) / step, (ya - yd) / step, (yb - yd) / step
-        det = a * d - b * c
-        with np.errstate(invalid="ignore", divide="ignore"):
-            dx, dy = (d * ex - b * ey) / det, (a * ey - c * ex) / det
-        xu, yu = xu - dx, yu - dy
-        if np.nanmax(np.hypot(dx, dy), initial=0.0) < 1e-13:
-            break
-    xd, yd = distort(xu, yu, distortion)
-    good = np.hypot(xd - x, yd - y) < 1e-9
-    return np.where(good, xu, np.nan), np.where(good, yu, np.nan)
 
 
 _MODELS: dict[str, type[Camera]] = {c.model: c for c in (PinholeCamera, OrthographicCamera, CylindricalCamera)}
