@@ -8,6 +8,7 @@ float32 coordinates to the centre rounds nothing.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from weakref import WeakKeyDictionary
 
@@ -55,8 +56,8 @@ def _build(surface: Surface) -> TriangleTree:
     n = len(surface.faces)
     if n == 0:
         raise SurfaceError("the surface has no faces; there is nothing to measure against")
-    depth = max(0, int(np.ceil(np.log2(n / FACES_PER_LEAF))))
-    step = 2.0 ** (np.floor(np.log2(max(surface.extent_mm, np.finfo(np.float32).tiny))) - 2)
+    depth = max(0, math.ceil(math.log2(n / FACES_PER_LEAF)))
+    step = 2.0 ** (math.floor(math.log2(max(surface.extent_mm, 2.0**-126))) - 2)
     centre = np.round(surface.bounds_mm.mean(axis=0) / step) * step
     corners = (surface.vertices - centre)[surface.faces].reshape(n, 9)
     keys = corners[:, 0:3] + corners[:, 3:6] + corners[:, 6:9]

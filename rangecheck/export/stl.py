@@ -1,0 +1,92 @@
+"""STL of solids, and the proof that what was written is still solid.
+
+STL holds float32 corners without indices. At 300 mm float32 steps by 3e-5 mm, so faces can lose their area and sheets can touch once
+rounded. Therefore the check is part of the export: the coordinates are rounded first, faces that lose their area are collapsed, the
+bytes are read back as a slicer would, welded where equal, and judged again. Only a `Solid` is exported.
+
+Binary: 80 bytes of header, a little-endian count, then per face normal, three corners, two bytes. Same solid, same bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from rangecheck.errors import NotSolid
+from rangecheck.files import whole_file
+from rangecheck.solid.findings import Verdict
+from rangecheck.solid.rounding import collapse_flat_faces
+from rangecheck.solid.solid import Solid, check_solid
+from rangecheck.surface.mesh_files import open_mesh
+from rangecheck.surface.surface import Surface
+
+_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+_HEADER = b"binary STL, millimetres, written by rangecheck"
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What was written: the file, its faces, the check of its own bytes, and the farthest that rounding moved a vertex."""
+
+    path: Path
+    faces: int
+    verdict: Verdict
+    moved_mm: float
+
+
+def write_stl(solid: Solid | Surface, path: str | Path, *, force: bool = True, force_open: bool = False) -> Exported:
+    """Write binary STL in mm, whole or not at all, and check what the file says.
+
+    A Surface that is no Solid is refused with NotSolid unless `force_open`; then the verdict on its bytes is returned, not raised.
+    Raises OutputError when the file cannot be written or exists and `force` is False."""
+    surface = solid.surface if isinstance(solid, Solid) else solid
+    if not isinstance(solid, Solid) and not force_open:
+        raise NotSolid("only a Solid is exported as STL; make one with Solid.from_surface(), or force an open file", findings=())
+    rounded, moved = as_float32(surface)
+    if isinstance(solid, Solid):
+        rounded = collapse_flat_faces(rounded)
+    with proved_file(path, force=force, must_be_solid=not force_open) as (part, judged), part.open("wb") as stream:
+        stream.write(_HEADER.ljust(80, b" ") + np.uint32(len(rounded.faces)).astype("<u4").tobytes())
+        for start in range(0, len(rounded.faces), 1 << 18):
+            stream.write(_records(rounded, slice(start, start + (1 << 18))).tobytes())
+    return Exported(Path(path), len(rounded.faces), judged[0], moved)
+
+
+@contextmanager
+def proved_file(path: str | Path, *, force: bool, must_be_solid: bool) -> Iterator[tuple[Path, list[Verdict]]]:
+    """A file to be written in the block; it gets its name only after its bytes were read back and judged (the verdict is appended to
+    the list). Raises NotSolid when they are not solid although `must_be_solid`."""
+    judged: list[Verdict] = []
+    with whole_file(path, force=force) as part:
+        yield part, judged
+        verdict = check_solid(open_mesh(part, "mm").surface)
+        if must_be_solid and not verdict.fit:
+            raise NotSolid(f"{path}: read back as float32 it is {verdict.sentence()}", findings=verdict.findings, verdict=verdict)
+        judged.append(verdict)
+
+
+def as_float32(surface: Surface) -> tuple[Surface, float]:
+    """`surface` with its coordinates rounded to float32, and the farthest that moved a vertex."""
+    rounded = surface.vertices.astype(np.float32).astype(np.float64)
+    moved = float(np.abs(rounded - surface.vertices).max(initial=0.0))
+    return (
+        Surface(
+            rounded, surface.faces, surface.part_of_face, surface.origin_of_face, surface.part_names, surface.vertex_error_mm
+        ),
+        moved,
+    )
+
+
+def _records(surface: Surface, faces: slice) -> npt.NDArray[np.void]:
+    corners = surface.vertices[surface.faces[faces]]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    records = np.zeros(len(corners), _RECORD)
+    records["corners"] = corners
+    records["normal"] = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+    return records

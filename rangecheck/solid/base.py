@@ -1,0 +1,101 @@
+"""Cutting a solid by a plane, and choosing where a bust is cut flat to stand.
+
+The plane's cap is of part "base" and invented; all other faces keep part and origin, and where the plane does not pass, their vertices.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rangecheck.arrays import FloatArray, require
+from rangecheck.errors import SurfaceError
+from rangecheck.solid.engine import from_engine, to_engine
+from rangecheck.solid.solid import Solid
+from rangecheck.surface.surface import INVENTED
+
+UP = (0.0, 1.0, 0.0)
+
+
+@dataclass(frozen=True)
+class BaseHeight:
+    """Where to cut: `height_mm` along `up`, why there in one sentence, and the share of volume that goes."""
+
+    height_mm: float
+    reason: str
+    removed_share: float
+
+
+def cut_flat(solid: Solid, *, height_mm: float, up: npt.ArrayLike = UP) -> Solid:
+    """What of `solid` lies above the plane up . x = height_mm, capped there. Raises SurfaceError when nothing or all would remain."""
+    normal = _unit(up)
+    heights = solid.surface.vertices @ normal
+    low, high = float(heights.min()), float(heights.max())
+    if not low < height_mm < high:
+        raise SurfaceError(
+            f"the plane at {height_mm:.3f} mm misses the solid, which reaches from {low:.3f} to {high:.3f} mm; choose a height between",
+            height_mm=height_mm,
+            low_mm=low,
+            high_mm=high,
+        )
+    engine, number = to_engine(solid.surface)
+    kept = engine.trim_by_plane(tuple(normal), float(height_mm))
+    surface = from_engine(kept, [(number, solid.surface)], "base")
+    removed = 1 - surface.volume_mm3 / solid.volume_mm3
+    note = f"cut flat at {height_mm:.3f} mm: {removed:.2%} of the volume went"
+    return Solid.from_surface(surface, notes=(*solid.notes, note))
+
+
+def choose_base_height(solid: Solid, *, up: npt.ArrayLike = UP, most_removed: float = 0.35) -> BaseHeight:
+    """The lowest plane above which the sides are measured: below it lies what was invented to close the bottom.
+
+    Walking upwards in 200 levels, the cut is where the invented share of the area, over the next 2 % of the height, first falls
+    below half; at most `most_removed` of the height is given up. A solid without invented faces near its bottom is cut 1 % above it,
+    which only makes it stand flat."""
+    normal = _unit(up)
+    surface = solid.surface
+    heights = surface.vertices @ normal
+    low, high = float(heights.min()), float(heights.max())
+    tall = high - low
+    middle = heights[surface.faces].mean(axis=1)
+    level = np.minimum(((middle - low) / tall * 200).astype(int), 199)
+    areas = surface.face_areas
+    invented: FloatArray = np.bincount(level, areas * (surface.origin_of_face == INVENTED), minlength=200).astype(np.float64)
+    total: FloatArray = np.bincount(level, areas, minlength=200).astype(np.float64)
+    share = _moving_sum(invented, 4) / np.maximum(_moving_sum(total, 4), 1e-300)
+    limit = int(most_removed * 200)
+    mostly_measured = np.flatnonzero(share[: limit + 1] < 0.5)
+    invented_bottom = share[0] >= 0.5
+    if not invented_bottom:
+        step, reason = 2, "the bottom is measured; the cut only makes it flat"
+    elif len(mostly_measured):
+        step = int(mostly_measured[0])
+        reason = f"below {low + step / 200 * tall:.1f} mm more than half of the surface is invented"
+    else:
+        step = limit
+        reason = f"invented surface reaches above {most_removed:.0%} of the height; no more is given up"
+    height = low + max(step, 1) / 200 * tall
+    below = _share_below(solid, normal, height)
+    return BaseHeight(float(height), reason, below)
+
+
+def _share_below(solid: Solid, normal: FloatArray, height_mm: float) -> float:
+    engine, _ = to_engine(solid.surface)
+    return 1.0 - float(engine.trim_by_plane(tuple(normal), float(height_mm)).volume()) / solid.volume_mm3
+
+
+def _moving_sum(values: FloatArray, width: int) -> FloatArray:
+    """Sum of each value and the next width - 1."""
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    last = np.minimum(np.arange(len(values)) + width, len(values))
+    return total[last] - total[: len(values)]
+
+
+def _unit(up: npt.ArrayLike) -> FloatArray:
+    direction = require("up", up, (3,), finite=True)
+    length = float(np.linalg.norm(direction))
+    if length == 0:
+        raise SurfaceError("up has length 0; a plane needs a direction")
+    return direction / length

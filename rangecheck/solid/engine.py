@@ -1,0 +1,100 @@
+"""The one adapter of manifold3d (3.5): to it and back, keeping which face came from which.
+
+Its traps: float32 `Mesh` rounds, so `Mesh64` is used throughout; a refused mesh becomes an empty solid whose `status()` says why and
+which empties whatever it meets; faces with the same `face_id` may be merged where they are coplanar, so every face gets its own;
+vertices must be shared by index; booleans drop what is thinner than its tolerance (about 1e-12 of the extent in double precision).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from rangecheck.arrays import FloatArray, IntArray
+from rangecheck.errors import DependencyMissing, NotSolid
+from rangecheck.surface.surface import INVENTED, Surface
+
+
+def _manifold3d() -> Any:
+    try:
+        import manifold3d
+    except ImportError:
+        raise DependencyMissing("manifold3d", "solids", "pip install manifold3d") from None
+    return manifold3d
+
+
+def to_engine(surface: Surface) -> tuple[Any, int]:
+    """The surface as a manifold3d solid, and the number by which its faces are known in later results.
+
+    Raises NotSolid, with the engine's word, when it is refused."""
+    m3d = _manifold3d()
+    name = int(m3d.Manifold.reserve_ids(1))
+    faces = np.ascontiguousarray(surface.faces, np.uint64)
+    mesh = m3d.Mesh64(
+        vert_properties=np.array(surface.vertices),
+        tri_verts=faces,
+        run_index=np.array([0, 3 * len(faces)], np.uint64),
+        run_original_id=np.array([name], np.uint32),
+        face_id=np.arange(len(faces), dtype=np.uint64),
+    )
+    solid = m3d.Manifold(mesh)
+    status = solid.status()
+    if status != m3d.Error.NoError or solid.is_empty():
+        word = status.name if status != m3d.Error.NoError else "empty"
+        raise NotSolid(
+            f"manifold3d refuses the surface ({word}); check_solid() says where it is not solid", word=word, findings=()
+        )
+    return solid, name
+
+
+def from_engine(solid: Any, sources: Sequence[tuple[int, Surface]], new_part: str, new_origin: int = INVENTED) -> Surface:
+    """The engine's solid as a surface. Faces that came from `sources` (number, surface) keep part and origin; all others belong
+    to `new_part` and are of `new_origin`."""
+    mesh = solid.to_mesh64()
+    vertices = np.array(mesh.vert_properties[:, :3], np.float64)
+    faces = np.array(mesh.tri_verts, np.int64)
+    merge_from, merge_to = np.asarray(mesh.merge_from_vert, np.int64), np.asarray(mesh.merge_to_vert, np.int64)
+    if len(merge_from):
+        target = np.arange(len(vertices))
+        target[merge_from] = merge_to
+        faces = target[faces]
+    source_of, face_of = _provenance(mesh, len(faces))
+    names: list[str] = []
+    part = np.zeros(len(faces), np.int32)
+    origin = np.full(len(faces), new_origin, np.uint8)
+    known = np.zeros(len(faces), bool)
+    for number, surface in sources:
+        here = source_of == number
+        known |= here
+        origin[here] = surface.origin_of_face[face_of[here]]
+        for i, name in enumerate(surface.part_names):
+            mine = here & (surface.part_of_face[np.minimum(face_of, len(surface.faces) - 1)] == i)
+            if mine.any():
+                part[mine] = _index_of(names, name)
+    if not known.all():
+        part[~known] = _index_of(names, new_part)
+    used, place = np.unique(faces, return_inverse=True)
+    return Surface(vertices[used], place.reshape(-1, 3), part, origin, tuple(names))
+
+
+def _index_of(names: list[str], name: str) -> int:
+    if name not in names:
+        names.append(name)
+    return names.index(name)
+
+
+def _provenance(mesh: Any, count: int) -> tuple[IntArray, IntArray]:
+    """Number of the source solid and face within it, of each face of an engine's mesh."""
+    runs = np.asarray(mesh.run_index, np.int64) // 3
+    source = np.repeat(np.asarray(mesh.run_original_id, np.int64), np.diff(runs))
+    face = np.asarray(mesh.face_id, np.int64)
+    if len(source) != count or len(face) != count:
+        return np.full(count, -1), np.zeros(count, np.int64)
+    return source, face
+
+
+def triangulate(rings: Sequence[FloatArray]) -> IntArray:
+    """(k, 3) triangles over the points of plane rings (n, 2) taken one after another: outer rings counter-clockwise, holes clockwise."""
+    return np.asarray(_manifold3d().triangulate([np.ascontiguousarray(r, np.float64) for r in rings]), np.int64).reshape(-1, 3)

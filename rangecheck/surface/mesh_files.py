@@ -1,0 +1,184 @@
+"""Reading mesh files as surfaces in millimetres: STL, PLY, OBJ, OFF by own readers, GLB and 3MF through trimesh.
+
+STL, PLY, OBJ and OFF do not say their unit, so it is asked for; GLB is metres by its specification, 3MF says. Vertices that faces name
+are welded where their coordinates are equal bit for bit, as STL, which has no indices, would weld them; nothing is merged by nearness,
+dropped or turned.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rangecheck.arrays import FloatArray, IntArray, mm_per
+from rangecheck.errors import DependencyMissing, InputError, UnitMissing
+from rangecheck.files import read_bytes
+from rangecheck.surface.ply_files import ply_mesh
+from rangecheck.surface.stl_files import stl_corners
+from rangecheck.surface.surface import Surface
+from rangecheck.surface.weld import weld_exactly
+
+FORMATS = ("stl", "ply", "obj", "off", "glb", "3mf")
+#: 3MF's names of units
+_UNITS_3MF = {"micron": "um", "millimeter": "mm", "centimeter": "cm", "meter": "m", "inch": "in"}
+
+
+@dataclass(frozen=True)
+class MeshFile:
+    """A mesh file that was read: its surface in mm, its format and unit, and what was odd about it, in sentences."""
+
+    surface: Surface
+    format: str
+    unit: str
+    notes: tuple[str, ...]
+
+
+def read_mesh(path: str | Path, unit: str | None = None) -> Surface:
+    """The surface in a mesh file. `unit` mm, cm, m, um, in. Raises InputError, or UnitMissing where the file does not say."""
+    return open_mesh(path, unit).surface
+
+
+def open_mesh(path: str | Path, unit: str | None = None) -> MeshFile:
+    """As `read_mesh`, with what was found out about the file."""
+    path = Path(path)
+    content = read_bytes(path)
+    kind = _format(path, content)
+    notes: list[str] = []
+    vertices: FloatArray
+    faces: IntArray
+    if kind == "stl":
+        corners, notes = stl_corners(path, content)
+        _finite(path, corners.reshape(-1, 3), 3)
+        first, number = weld_exactly(corners.reshape(-1, 3))
+        vertices, faces = corners.reshape(-1, 3)[first].astype(np.float64), number.reshape(-1, 3)
+        notes.append(f"{len(number)} corners were welded to {len(first)} vertices where their float32 coordinates are equal")
+    elif kind == "ply":
+        vertices, faces, notes = ply_mesh(path, content)
+    elif kind == "obj":
+        vertices, faces = _obj(path, content)
+    elif kind == "off":
+        vertices, faces = _off(path, content)
+    else:
+        vertices, faces, said = _through_trimesh(path, content, kind)
+        unit = unit or said
+    if len(faces) == 0:
+        raise InputError(path, "holds no faces; export it again")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise InputError(
+            path, f"its faces name vertices {faces.min()} to {faces.max()}, and it has {len(vertices)}; the file is damaged"
+        )
+    _finite(path, vertices, 1)
+    if unit is None:
+        raise UnitMissing(path)
+    if kind != "stl":
+        vertices, faces = _welded(vertices, faces, notes)
+    return MeshFile(Surface(vertices * mm_per(unit), faces, part_names=(path.stem,)), kind, unit, tuple(notes))
+
+
+def _format(path: Path, content: bytes) -> str:
+    """By magic bytes where a format has them, else by the file's ending."""
+    if not content:
+        raise InputError(path, "is empty; export it again")
+    if content[:4] == b"glTF":
+        return "glb"
+    if content[:4] == b"ply\n" or content[:4] == b"ply\r":
+        return "ply"
+    ending = path.suffix.lower().lstrip(".")
+    if ending not in FORMATS:
+        raise InputError(path, f"has the ending {path.suffix!r}; mesh files end in {', '.join(FORMATS)}")
+    return ending
+
+
+def _finite(path: Path, vertices: FloatArray, per_face: int) -> None:
+    bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
+    if len(bad):
+        where = f"{len(np.unique(bad // 3))} faces have corners" if per_face == 3 else f"{len(bad)} vertices have coordinates"
+        name = "face" if per_face == 3 else "vertex"
+        raise InputError(
+            path,
+            f"{where} that are not finite numbers, the first in {name} {bad[0] // per_face}; export it again",
+            count=len(bad),
+        )
+
+
+def _welded(vertices: FloatArray, faces: IntArray, notes: list[str]) -> tuple[FloatArray, IntArray]:
+    """Vertices that faces name become one where their coordinates are equal; vertices that no face names stay."""
+    used = np.zeros(len(vertices), bool)
+    used[faces.ravel()] = True
+    first, number = weld_exactly(vertices[used])
+    if len(first) == len(number):
+        return vertices, faces
+    notes.append(f"{len(number)} vertices were welded to {len(first)} where their coordinates are equal")
+    place = np.zeros(len(vertices), np.int64)
+    place[used] = number
+    return np.concatenate([vertices[used][first], vertices[~used]]), place[faces]
+
+
+def _obj(path: Path, content: bytes) -> tuple[FloatArray, IntArray]:
+    vertices: list[tuple[float, float, float]] = []
+    faces: list[tuple[int, int, int]] = []
+    for number, line in enumerate(content.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines(), 1):
+        words = line.split()
+        if not words or words[0] not in (b"v", b"f"):
+            continue
+        try:
+            if words[0] == b"v":
+                vertices.append((float(words[1]), float(words[2]), float(words[3])))
+            else:
+                ring = [int(word.split(b"/", 1)[0]) for word in words[1:]]
+                ring = [i - 1 if i > 0 else len(vertices) + i for i in ring]
+                faces.extend((ring[0], ring[k], ring[k + 1]) for k in range(1, len(ring) - 1))
+        except (ValueError, IndexError):
+            raise InputError(path, f"line {number} is not OBJ: {line[:60]!r}; export it again") from None
+    return np.array(vertices, np.float64).reshape(-1, 3), np.array(faces, np.int64).reshape(-1, 3)
+
+
+def _off(path: Path, content: bytes) -> tuple[FloatArray, IntArray]:
+    lines = [line for raw in content.splitlines() if (line := raw.split(b"#", 1)[0].split())]
+    head = lines[0][0].upper() if lines else b""
+    if head not in (b"OFF", b"COFF", b"NOFF", b"CNOFF"):
+        raise InputError(path, "does not begin with OFF; it is no OFF file")
+    try:
+        lines[0] = lines[0][1:]
+        at = 0 if lines[0] else 1
+        n, m = int(lines[at][0]), int(lines[at][1])
+        rows, rings = lines[at + 1 : at + 1 + n], lines[at + 1 + n : at + 1 + n + m]
+        if n < 0 or m < 0 or len(rows) < n or len(rings) < m:
+            raise InputError(
+                path, f"counts {n} vertices and {m} faces and has {len(lines) - at - 1} lines for them; the file is cut off"
+            )
+        vertices = np.array([[float(x) for x in row[:3]] for row in rows], np.float64).reshape(-1, 3)
+        faces: list[tuple[int, int, int]] = []
+        for row in rings:
+            ring = [int(x) for x in row[1 : 1 + int(row[0])]]
+            if len(ring) != int(row[0]):
+                raise ValueError
+            faces.extend((ring[0], ring[k], ring[k + 1]) for k in range(1, len(ring) - 1))
+    except (ValueError, IndexError):
+        raise InputError(path, "holds lines that are not OFF; export it again") from None
+    return vertices, np.array(faces, np.int64).reshape(-1, 3)
+
+
+def _through_trimesh(path: Path, content: bytes, kind: str) -> tuple[FloatArray, IntArray, str]:
+    """Vertices, faces and unit of GLB or 3MF, all instances placed by their transforms."""
+    import io
+
+    try:
+        import trimesh
+    except ImportError:
+        raise DependencyMissing("trimesh", f"reading {kind.upper()}", "pip install trimesh") from None
+    try:
+        scene = trimesh.load_scene(io.BytesIO(content), file_type=kind)
+        mesh = scene.to_mesh() if scene.geometry else None
+    except ImportError as error:
+        raise DependencyMissing(
+            error.name or "a package", f"reading {kind.upper()}", "pip install 'rangecheck[formats]'"
+        ) from None
+    except Exception as error:  # a foreign reader may raise anything on a damaged file
+        raise InputError(path, f"cannot be read as {kind.upper()} ({type(error).__name__}: {error}); export it again") from None
+    if mesh is None:
+        raise InputError(path, "holds no faces; export it again")
+    said = "m" if kind == "glb" else _UNITS_3MF.get(str(scene.units or "millimeter").rstrip("s"), "mm")
+    return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64), said

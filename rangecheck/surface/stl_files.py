@@ -1,0 +1,76 @@
+"""Reading STL, both kinds, told apart by what the file holds and not by its first word.
+
+Binary: 80 bytes of anything, a little-endian count, then 50 bytes per face: normal, three corners, two bytes of attribute. Many
+writers begin a binary file with "solid". The normals are not read: the corners' order says the same, and cannot contradict itself.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from rangecheck.arrays import FloatArray
+from rangecheck.errors import InputError
+
+_HEADER = 84
+_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+_NUMBER = rb"([^\s]+)"
+_VERTEX = re.compile(rb"vertex\s+" + _NUMBER + rb"\s+" + _NUMBER + rb"\s+" + _NUMBER, re.IGNORECASE)
+
+
+def stl_corners(path: Path, content: bytes) -> tuple[FloatArray, list[str]]:
+    """(m, 3, 3) float32 corners of an STL file's faces, and what was odd about it. Raises InputError."""
+    looks_ascii = content[:512].lstrip()[:5].lower() == b"solid" and b"facet" in content[:4096].lower()
+    stated = int.from_bytes(content[80:84], "little") if len(content) >= _HEADER else None
+    fits = stated is not None and len(content) == _HEADER + _RECORD.itemsize * stated
+    if looks_ascii and not fits:
+        return _ascii(path, content)
+    if stated is None:
+        if content[:512].lstrip()[:5].lower() == b"solid":
+            raise InputError(path, "holds no faces; export it again")
+        raise InputError(path, f"is {len(content)} bytes long, too short for STL; export it again")
+    return _binary(path, content, stated)
+
+
+def _binary(path: Path, content: bytes, stated: int) -> tuple[FloatArray, list[str]]:
+    notes = []
+    room = (len(content) - _HEADER) // _RECORD.itemsize
+    if stated > room:
+        raise InputError(
+            path,
+            f"its header counts {stated} faces, its {len(content)} bytes have room for {room}: the file is cut off or no STL; "
+            "copy or export it again",
+            stated=stated,
+            room=room,
+        )
+    extra = len(content) - _HEADER - _RECORD.itemsize * stated
+    if extra:
+        notes.append(f"{extra} bytes follow the last of the {stated} faces that its header counts; they were left out")
+    if content[:5].lower() == b"solid":
+        notes.append('it begins with "solid" like an ASCII file, and is binary')
+    faces = np.frombuffer(content, _RECORD, stated, _HEADER)
+    return np.ascontiguousarray(faces["corners"]), notes
+
+
+def _ascii(path: Path, content: bytes) -> tuple[FloatArray, list[str]]:
+    lowered = content.lower()
+    faces = lowered.count(b"endfacet")
+    begun = lowered.count(b"facet") - faces
+    words = _VERTEX.findall(content)
+    if begun != faces or len(words) != 3 * faces or b"endsolid" not in lowered[-4096:]:
+        raise InputError(
+            path,
+            f"it begins {begun} faces, ends {faces} and gives {len(words)} corners where {3 * begun} are due, "
+            f"{'and' if b'endsolid' in lowered[-4096:] else 'without'} endsolid: the file is cut off or damaged; export it again",
+            begun=begun,
+            ended=faces,
+        )
+    try:
+        corners = np.array(words, dtype=np.bytes_).astype(np.float64)
+    except ValueError as error:
+        comma = " (a comma stands where a point is due)" if b"," in b"".join(words[0]) else ""
+        raise InputError(path, f"a corner is not a number{comma}: {error}; export it again") from None
+    with np.errstate(over="ignore"):
+        return corners.astype(np.float32).reshape(-1, 3, 3), ["it is an ASCII file; its numbers were taken to float32"]

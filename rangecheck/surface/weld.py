@@ -1,0 +1,47 @@
+"""Corners that are the same point become one vertex: bit for bit, with no tolerance, numbered in the order they first appear.
+
+STL repeats each vertex in every face; whoever wrote it wrote the same bits each time. 0 and -0 are the same point.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rangecheck.arrays import FloatArray, IntArray
+from rangecheck.kernels import kernel
+
+
+def weld_exactly(points: FloatArray) -> tuple[IntArray, IntArray]:
+    """First index of each distinct row of `points` (n, 3) float32 or float64, and for each row the number of its point (n,) int32."""
+    rows = np.ascontiguousarray(points) + 0.0  # -0 + 0 = 0
+    bits = rows.view(np.uint32 if rows.dtype == np.float32 else np.uint64).reshape(-1, 3)
+    slots = 1 << max(4, int(2 * len(rows) - 1).bit_length())
+    return first_of_each(bits, slots)
+
+
+@kernel
+def first_of_each(bits, slots):
+    """Open addressing with linear steps in a table of `slots` places, a power of two at least twice the rows."""
+    table = np.full(slots, -1, np.int32)
+    first, number = np.empty(len(bits), np.int32), np.empty(len(bits), np.int32)
+    count = 0
+    mask = np.uint64(slots - 1)
+    for i in range(len(bits)):
+        x, y, z = bits[i, 0], bits[i, 1], bits[i, 2]
+        h = np.uint64(x) * np.uint64(0x9E3779B97F4A7C15)
+        h = ((h ^ (h >> np.uint64(29))) + np.uint64(y)) * np.uint64(0xBF58476D1CE4E5B9)
+        h = ((h ^ (h >> np.uint64(32))) + np.uint64(z)) * np.uint64(0x94D049BB133111EB)
+        place = (h ^ (h >> np.uint64(31))) & mask
+        while True:
+            known = table[place]
+            if known < 0:
+                table[place] = count
+                first[count], number[i] = i, count
+                count += 1
+                break
+            j = first[known]
+            if bits[j, 0] == x and bits[j, 1] == y and bits[j, 2] == z:
+                number[i] = known
+                break
+            place = (place + np.uint64(1)) & mask
+    return first[:count].copy(), number
