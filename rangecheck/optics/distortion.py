@@ -33,10 +33,10 @@ def fold_radius(distortion: tuple[float, ...]) -> float:
     top, bottom = np.polynomial.Polynomial([1, k1, k2, k3]), np.polynomial.Polynomial([1, k4, k5, k6])
     s = np.polynomial.Polynomial([0, 1])
     slope = top * bottom + 2 * s * (top.deriv() * bottom - top * bottom.deriv())
-    radii2 = [
-        float(root.real) for p in (slope, bottom) for root in p.roots() if abs(root.imag) < 1e-9 * abs(root) and root.real > 0
-    ]
-    return math.sqrt(min(radii2)) if radii2 else math.inf
+    roots = np.concatenate([slope.roots(), bottom.roots()]).astype(np.complex128)
+    real = np.asarray(roots.real, dtype=np.float64)
+    radii2 = real[(real > 0) & (np.abs(roots.imag) < 1e-9 * np.abs(real))]
+    return math.sqrt(float(radii2.min())) if len(radii2) else math.inf
 
 
 @inline_kernel
