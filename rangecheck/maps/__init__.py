@@ -2,6 +2,21 @@
 
 from rangecheck.maps.inside import require_outside, winding_number
 from rangecheck.maps.proof import BackProjection, back_projection_error
+from rangecheck.maps.secondary import Chain, smooth_normals, trace_chain
+from rangecheck.maps.shadow import Shadows, trace_shadows, values_seen
 from rangecheck.maps.trace import Maps, trace_maps
 
-__all__ = ["BackProjection", "Maps", "back_projection_error", "require_outside", "trace_maps", "winding_number"]
+__all__ = [
+    "BackProjection",
+    "Chain",
+    "Maps",
+    "Shadows",
+    "back_projection_error",
+    "require_outside",
+    "smooth_normals",
+    "trace_chain",
+    "trace_maps",
+    "trace_shadows",
+    "values_seen",
+    "winding_number",
+]
