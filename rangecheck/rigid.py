@@ -87,6 +87,25 @@ def rotation_from_quaternion(quaternion_xyzw: npt.ArrayLike) -> FloatArray:
     )
 
 
+def quaternion_from_rotation(rotation: npt.ArrayLike) -> FloatArray:
+    """(4,) unit quaternion (x, y, z, w), w >= 0, of a rotation (3, 3), from its largest component (Shepperd 1978)."""
+    r = require("rotation", rotation, (3, 3), finite=True)
+    trace = float(np.trace(r))
+    squares = np.array([1 - trace + 2 * r[0, 0], 1 - trace + 2 * r[1, 1], 1 - trace + 2 * r[2, 2], 1 + trace])
+    k = int(np.argmax(squares))
+    # the symmetric matrix 4 q q^T, written out
+    products = np.array(
+        [
+            [squares[0], r[0, 1] + r[1, 0], r[2, 0] + r[0, 2], r[2, 1] - r[1, 2]],
+            [r[0, 1] + r[1, 0], squares[1], r[1, 2] + r[2, 1], r[0, 2] - r[2, 0]],
+            [r[2, 0] + r[0, 2], r[1, 2] + r[2, 1], squares[2], r[1, 0] - r[0, 1]],
+            [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], squares[3]],
+        ]
+    )[k]
+    quaternion = products / np.linalg.norm(products)
+    return -quaternion if quaternion[3] < 0 else quaternion
+
+
 def about_axis(axis: npt.ArrayLike, angle_rad: float) -> FloatArray:
     """(4, 4) rotation by `angle_rad` about `axis` through the origin (Rodrigues; (41) with its axis made unit)."""
     a = require("axis", axis, (3,), finite=True)
