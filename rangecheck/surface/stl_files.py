@@ -70,7 +70,7 @@ def _ascii(path: Path, content: bytes) -> tuple[FloatArray, list[str]]:
     try:
         corners = np.array(words, dtype=np.bytes_).astype(np.float64)
     except ValueError as error:
-        comma = " (a comma stands where a point is due)" if b"," in b"".join(words[0]) else ""
+        comma = " (a comma stands where a point is due)" if any(b"," in word for row in words for word in row) else ""
         raise InputError(path, f"a corner is not a number{comma}: {error}; export it again") from None
     with np.errstate(over="ignore"):
         return corners.astype(np.float32).reshape(-1, 3, 3), ["it is an ASCII file; its numbers were taken to float32"]

@@ -1,0 +1,171 @@
+"""Mesh files of every kind come to the same surface, and what is wrong with a file is said in one line."""
+
+import struct
+
+import numpy as np
+import pytest
+from test_topology_distance import CUBE_CORNERS, CUBE_FACES, cube
+
+from rangecheck.errors import InputError, UnitMissing
+from rangecheck.surface import topology as topo
+from rangecheck.surface.mesh_files import open_mesh, read_mesh
+from rangecheck.surface.weld import weld_exactly
+
+QUADS = [[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]]
+
+
+def binary_stl(triangles, header=b"made by hand"):
+    rows = b"".join(struct.pack("<12fH", 0, 0, 0, *np.asarray(t, float).ravel(), 0) for t in triangles)
+    return header.ljust(80) + struct.pack("<I", len(triangles)) + rows
+
+
+def ascii_stl(triangles):
+    lines = ["solid by hand"]
+    for t in triangles:
+        lines += [
+            "facet normal 0 0 0",
+            " outer loop",
+            *(f"  vertex {x!r} {y!r} {z!r}" for x, y, z in t.tolist()),
+            " endloop",
+            "endfacet",
+        ]
+    return "\n".join([*lines, "endsolid by hand"]).encode()
+
+
+def ascii_ply(faces, header_end="\n"):
+    head = ["ply", "format ascii 1.0", "comment corners", "element vertex 8", "property float x", "property float y", "property float z",
+            "property uchar red", f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]  # fmt: skip
+    rows = [f"{x} {y} {z} 7" for x, y, z in CUBE_CORNERS.tolist()] + [" ".join(map(str, [len(f), *f])) for f in faces]
+    return header_end.join(head + rows).encode() + header_end.encode()
+
+
+def binary_ply(order, faces):
+    name = {"<": "little", ">": "big"}[order]
+    head = (
+        f"ply\nformat binary_{name}_endian 1.0\nelement vertex 8\nproperty double x\nproperty double y\nproperty double z\n"
+        f"element face {len(faces)}\nproperty list uchar uint vertex_index\nproperty short label\nend_header\n"
+    )
+    body = CUBE_CORNERS.astype(order + "f8").tobytes()
+    return head.encode() + body + b"".join(struct.pack(f"{order}B{len(f)}Ih", len(f), *f, 3) for f in faces)
+
+
+def obj(faces):
+    rows = [f"v {x} {y} {z} 1.0" for x, y, z in CUBE_CORNERS.tolist()]
+    return "\n".join(
+        ["mtllib ../../etc/passwd", *rows, "vt 0 0", *("f " + " ".join(f"{i + 1}/1/1" for i in f) for f in faces)]
+    ).encode()
+
+
+def off(faces):
+    rows = [f"{x} {y} {z}" for x, y, z in CUBE_CORNERS.tolist()] + [" ".join(map(str, [len(f), *f])) for f in faces]
+    return "\n".join(["OFF", "# corners", f"8 {len(faces)} 0", *rows]).encode()
+
+
+TRIANGLES = CUBE_CORNERS[CUBE_FACES]
+CUBES = {
+    "binary.stl": binary_stl(TRIANGLES),
+    "solid_binary.stl": binary_stl(TRIANGLES, b"solid facet says it is ASCII"),
+    "ascii.STL": ascii_stl(TRIANGLES),
+    "upper.stl": ascii_stl(TRIANGLES).upper(),
+    "triangles.ply": ascii_ply(CUBE_FACES.tolist()),
+    "crlf.ply": ascii_ply(CUBE_FACES.tolist(), "\r\n"),
+    "quads.ply": ascii_ply(QUADS),
+    "little.ply": binary_ply("<", CUBE_FACES.tolist()),
+    "big.ply": binary_ply(">", CUBE_FACES.tolist()),
+    "big_quads.ply": binary_ply(">", QUADS),
+    "cube.obj": obj(QUADS),
+    "relative.obj": obj([[i - 8 - 1 for i in f] for f in QUADS]),
+    "cube.off": off(QUADS),
+}
+
+
+@pytest.mark.parametrize("name", CUBES)
+def test_every_kind_of_file_gives_the_same_cube(tmp_path, name):
+    (tmp_path / name).write_bytes(CUBES[name])
+    read = read_mesh(tmp_path / name, "cm")
+    assert len(read.vertices) == 8 and len(read.faces) == 12 and topo.is_closed(read)
+    assert read.volume_mm3 == pytest.approx(1000.0)
+    with pytest.raises(UnitMissing, match="--unit mm, cm, m, um or in"):
+        read_mesh(tmp_path / name)
+
+
+@pytest.mark.parametrize(("kind", "volume_mm3"), [("glb", 8e9), ("3mf", 8.0)])
+def test_glb_is_in_metres_and_3mf_says_its_unit(tmp_path, kind, volume_mm3):
+    import trimesh
+
+    pytest.importorskip("lxml", reason="trimesh reads and writes 3MF with lxml")
+    trimesh.Trimesh(cube().vertices, cube().faces, process=False).export(tmp_path / f"c.{kind}")
+    read = open_mesh(tmp_path / f"c.{kind}")
+    assert read.surface.volume_mm3 == pytest.approx(volume_mm3, rel=1e-6) and topo.is_closed(read.surface)
+
+
+def test_what_is_odd_is_said(tmp_path):
+    path = tmp_path / "odd.stl"
+    path.write_bytes(binary_stl(TRIANGLES, b"solid") + b"attached")
+    notes = " ".join(open_mesh(path, "mm").notes)
+    assert "8 bytes follow the last of the 12 faces" in notes and "is binary" in notes and "36 corners were welded to 8" in notes
+
+
+def test_zero_and_minus_zero_are_one_point_and_neighbours_are_not():
+    points = np.array([[0.0, 1, 2], [-0.0, 1, 2], [np.nextafter(np.float32(0), np.float32(1)), 1, 2]], np.float32)
+    first, number = weld_exactly(points)
+    assert first.tolist() == [0, 2] and number.tolist() == [0, 0, 1]
+
+
+def test_welding_agrees_with_sorting():
+    points = np.random.default_rng(2).integers(-3, 4, (5000, 3)).astype(np.float64)
+    first, number = weld_exactly(points)
+    assert np.array_equal(points[first][number], points)
+    assert len(first) == len(np.unique(points, axis=0)) and (np.diff(first) > 0).all()
+
+
+BROKEN = {
+    "nothing.stl": (b"", "is empty"),
+    "short.stl": (b"abc", "too short for STL"),
+    "none.stl": (binary_stl([]), "holds no faces"),
+    "headless.stl": (b"solid x\nendsolid x\n", "holds no faces"),
+    "cut.stl": (binary_stl(TRIANGLES)[:-20], "header counts 12 faces, its 664 bytes have room for 11"),
+    "lies.stl": (b"x" * 80 + b"\xff\xff\xff\xff" + b"y" * 50, "header counts 4294967295 faces"),
+    "nan.stl": (binary_stl([[[0, 0, 0], [1, 0, 0], [np.nan, 1, 0]]]), "1 faces have corners that are not finite numbers, the first in face 0"),
+    "cut_ascii.stl": (ascii_stl(TRIANGLES)[:-300], "cut off or damaged"),
+    "comma.stl": (ascii_stl(TRIANGLES).replace(b"1.0", b"1,0"), "a comma stands where a point is due"),
+    "cut.ply": (binary_ply("<", QUADS)[:-9], "ends within its 6 face elements"),
+    "cut_ascii.ply": (ascii_ply(QUADS)[:-9], "ends within its 6 face elements"),
+    "endless.ply": (b"ply\nformat ascii 1.0\nelement vertex 3\n", "header does not end"),
+    "huge.ply": (b"ply\nformat binary_little_endian 1.0\nelement vertex 999999999999\nproperty float x\nproperty float y\nproperty float z\n"
+                 b"element face 1\nproperty list uchar int vertex_indices\nend_header\n", "ends within its 999999999999 vertex"),
+    "word.ply": (b"ply\nformat ascii 1.0\nelement vertex three\nend_header\n", "is not PLY"),
+    "cloud.ply": (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 0\n",
+                  "points without faces"),
+    "scan.ply": (b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nelement range_grid 0\nproperty list uchar int i\nend_header\n",
+                 "a range scan, not a mesh"),
+    "index.ply": (ascii_ply([[0, 1, 99]]), "faces name vertices 0 to 99, and it has 8"),
+    "bad.obj": (b"v 0 0 zero\n", "line 1 is not OBJ"),
+    "index.obj": (b"v 0 0 0\nf 1 2 3\n", "name vertices 0 to 2"),
+    "bad.off": (b"OFF\n3 1 0\n0 0 0\n", "the file is cut off"),
+    "bad.glb": (b"glTF\x02\x00\x00\x00", "cannot be read as GLB"),
+    "bad.3mf": (b"PK\x03\x04", "cannot be read as 3MF"),
+    "picture.png": (b"\x89PNG", "mesh files end in stl, ply"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_broken_file_is_refused_in_one_line_that_names_it(tmp_path, name):
+    content, words = BROKEN[name]
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError) as refusal:
+        read_mesh(tmp_path / name, "mm")
+    assert words in str(refusal.value) and name in str(refusal.value) and "\n" not in str(refusal.value)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(InputError, match="does not exist"):
+        read_mesh(tmp_path / "missing.stl", "mm")
+
+
+@pytest.mark.real_data
+def test_the_zippered_bunny_is_as_open_as_it_is_known_to_be(real_data):
+    bunny = read_mesh(real_data / "stanford_bunny" / "bun_zipper.ply", "m")
+    assert len(topo.boundary_edges(bunny)) == 223 and len(topo.boundary_loops(bunny)) == 5
+    assert len(topo.unreferenced_vertices(bunny)) == 1113
+    assert 150 < np.ptp(bunny.vertices, axis=0).max() < 160
