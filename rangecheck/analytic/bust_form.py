@@ -1,4 +1,4 @@
-"""The form of the sample bust as one signed function: skull, face, ears, neck, chest and socle.
+"""The form of the sample bust as one signed function: skull, face, ears, neck, chest under a pinned cloak, and socle.
 
 Head frame: one unit is a hundredth of the head's height without hair (UNIT_MM), x to the sitter's left, y up, z to the front;
 chin at y = 0, eyes at 50, skull to 100; ear hole near z = 0. The proportions are the canon: eye as wide as a fifth of the head,
@@ -43,7 +43,7 @@ def _face(x, y, z):
     d = blend_min(d, limb(ax, y, z, 17.0, 19.0, 3.0, 7.0, 6.5, 31.5, 7.5, 6.0), 12.0)
     d = blend_min(d, limb(ax, y, z, 20.0, 41.0, 25.0, 26.5, 43.0, 4.0, 6.0, 4.5), 12.0)
     d = blend_min(d, limb(ax, y, z, 18.5, 22.0, 3.0, 25.0, 44.0, 0.0, 6.5, 5.0), 12.0)
-    d = blend_min(d, ellipsoid(ax, y, z, 14.0, 29.0, 25.0, 11.0, 14.0, 12.0), 10.0)
+    d = blend_min(d, ellipsoid(ax, y, z, 15.0, 30.0, 22.5, 11.0, 15.0, 13.5), 10.0)
     d = blend_min(d, ellipsoid(x, y, z, 0.0, 6.8, 37.0, 8.0, 6.8, 7.2), 6.0)
     # brow: a ridge that falls away outwards
     d = blend_min(d, limb(ax, y, z, 5.0, 57.0, 40.0, 15.0, 59.0, 37.3, 3.0, 3.0), 9.0)
@@ -104,27 +104,27 @@ def _mouth(x, y, z, d):
     ax = soft_abs(x, 0.8)
     # philtrum
     d = d + 0.9 * bump(x, 1.5) * ramp(y, 21.0, 24.0) * (1.0 - ramp(y, 26.5, 31.0)) * ramp(z, 36.0, 42.0)
-    upper = limb(ax, y, z, 1.9, 21.9, 43.0, 8.8, 19.9, 38.9, 3.0, 1.4)
+    upper = limb(ax, y, z, 1.9, 22.1, 42.9, 8.4, 20.0, 38.9, 3.2, 1.6)
     upper = blend_min(upper, ellipsoid(x, y, z, 0.0, 21.0, 43.5, 2.6, 2.2, 2.8), 2.2)
-    lower = limb(ax, y, z, 2.2, 16.6, 41.6, 8.2, 18.4, 38.6, 3.3, 1.6)
+    lower = limb(ax, y, z, 2.2, 16.5, 41.5, 7.8, 18.3, 38.7, 3.4, 1.8)
     d = blend_min(d, upper, 2.0)
     d = blend_min(d, lower, 2.4)
     # line between the lips, and the hollow below them
     line = y - (19.45 - 0.35 * bump(x, 1.8) + 0.25 * bump(ax - 5.0, 2.5))
-    width = 1.0 - ramp(ax, 7.8, 10.8)
+    width = 1.0 - ramp(ax, 7.4, 10.4)
     d = d + 1.25 * bump(line, 0.7) * width * ramp(z, 33.0, 37.0)
-    d = d + 0.9 * bump(ax - 10.2, 1.8) * bump(y - 19.5, 1.8) * ramp(z, 30.0, 34.0)
+    d = d + 0.9 * bump(ax - 9.8, 1.8) * bump(y - 19.5, 1.8) * ramp(z, 30.0, 34.0)
     return d + 0.7 * bump(y - 12.6, 2.4) * bump(x, 9.0) * ramp(z, 32.0, 38.0)
 
 
 @kernel
 def _ear(x, y, z, d):
     ax = abs(x)
-    px, py, pz = ax - 33.0, y - 43.0, z + 4.0
+    px, py, pz = ax - 32.3, y - 43.0, z + 4.0
     if px * px + py * py + pz * pz > 27.0 * 27.0:
         return d
     # ear frame: a to the front, b up the ear, c out of it; leaning back and standing off the head
-    lean, off = 0.2, 0.42
+    lean, off = 0.2, 0.34
     a0 = pz * math.cos(lean) + py * math.sin(lean)
     b = py * math.cos(lean) - pz * math.sin(lean)
     a = a0 * math.cos(off) + px * math.sin(off)
@@ -169,28 +169,64 @@ def head_function(x, y, z, heights):
 def body_function(x, y, z):
     """Neck, shoulders and chest with their rounded cut, body frame."""
     ax = soft_abs(x, 3.0)
-    d = limb(x, y, z, 0.0, -34.0, -15.0, 0.0, 22.0, -9.0, 24.5, 21.5)
+    d = limb(x, y, z, 0.0, -38.0, -17.0, 0.0, 22.0, -8.0, 24.5, 21.5)
     # trapezius, shoulders, rib cage
-    d = blend_min(d, limb(ax, y, z, 7.0, 8.0, -20.0, 60.0, -40.0, -19.0, 12.0, 14.0), 22.0)
-    chest = ellipsoid(x, y, z, 0.0, -74.0, -16.0, 62.0, 50.0, 34.0)
-    chest = blend_min(chest, ellipsoid(ax, y, z, 66.0, -56.0, -18.0, 25.0, 32.0, 27.0), 24.0)
-    chest = blend_min(chest, ellipsoid(ax, y, z, 28.0, -70.0, 4.0, 31.0, 24.0, 18.0), 14.0)
-    chest = blend_min(chest, ellipsoid(x, y, z, 0.0, -48.0, -14.0, 60.0, 16.0, 24.0), 16.0)
+    d = blend_min(d, limb(ax, y, z, 7.0, 6.0, -20.0, 60.0, -40.0, -19.0, 12.0, 14.0), 22.0)
+    d = blend_min(d, limb(x, y, z, 0.0, 0.0, -22.0, 0.0, -60.0, -34.0, 12.0, 20.0), 18.0)
+    chest = ellipsoid(x, y, z, 0.0, -74.0, -16.0, 62.0, 50.0, 37.0)
+    chest = blend_min(chest, ellipsoid(ax, y, z, 66.0, -56.0, -18.0, 25.0, 32.0, 29.0), 24.0)
+    chest = blend_min(chest, ellipsoid(ax, y, z, 28.0, -70.0, 7.0, 31.0, 24.0, 18.0), 14.0)
+    chest = blend_min(chest, ellipsoid(x, y, z, 0.0, -48.0, -12.0, 60.0, 16.0, 25.0), 16.0)
+    chest = blend_min(chest, ellipsoid(ax, y, z, 26.0, -54.0, -32.0, 26.0, 26.0, 18.0), 18.0)
+    chest = blend_min(chest, ellipsoid(x, y, z, 0.0, -70.0, 7.0, 26.0, 26.0, 16.5), 12.0)
     d = blend_min(d, chest, 18.0)
     # sternomastoids from behind the ears to the notch, collar bones
     d = blend_min(d, limb(ax, y, z, 5.0, -33.0, 9.5, 20.0, 27.0, -9.0, 3.6, 5.5), 8.0)
     d = blend_min(d, limb(ax, y, z, 6.0, -36.5, 9.5, 32.0, -33.0, 8.0, 3.4, 3.0), 9.0)
     d = blend_min(d, limb(ax, y, z, 32.0, -33.0, 8.0, 62.0, -31.0, -12.0, 3.0, 4.0), 10.0)
     d = blend_max(d, -ellipsoid(x, y, z, 0.0, -33.5, 16.5, 4.2, 4.5, 6.0), 5.0)
-    d = d + 1.4 * bump(x, 5.0) * ramp(-y, 40.0, 60.0) * ramp(z, 0.0, 12.0)
-    return d
+    return _cloak(x, y, z, d)
+
+
+@kernel
+def _fold(u, high, above, below):
+    """A fold with its crest at u = 0, steeper below."""
+    return high * bump(u, above if u < 0.0 else below)
+
+
+@kernel
+def _cloak(x, y, z, d):
+    """A cloak laid around the shoulders and pinned on the right one: u counts from its upper edge down, in units."""
+    if d > 12.0 or y > 12.0:
+        return d
+    fall = y - 4.0 + 0.72 * z + 0.13 * x
+    across = x / 1.22
+    r = math.sqrt(across * across + fall * fall + 1.0)
+    turn = 1.3 * across / r
+    u = r - 43.0 + 1.1 * math.sin(2.0 * turn + 0.8) + 0.6 * math.sin(5.0 * turn)
+    cloth = 1.9 + _fold(u - 2.4, 2.2, 1.8, 1.8)
+    cloth += _fold(u - 8.5 - 1.5 * turn, 1.9 * ramp(turn, -1.4, -0.3), 2.6, 1.6)
+    cloth += _fold(u - 12.5 + 2.5 * turn, 2.0 * ramp(-turn, -0.9, 0.4), 3.0, 1.7)
+    cloth += _fold(u - 18.0 - 3.5 * turn, 2.3, 3.2, 1.8)
+    cloth += _fold(u - 25.5 + 1.5 * turn, 2.1 * ramp(turn, -0.9, 0.3), 3.2, 1.8)
+    cloth += _fold(u - 31.0 - 4.0 * turn, 2.4 * ramp(-turn, -0.6, 0.7), 3.6, 1.9)
+    cloth += _fold(u - 38.0 + 2.0 * turn, 2.2, 3.8, 2.0)
+    cloth += _fold(u - 47.0 - 2.0 * turn, 2.2 * ramp(turn, -0.7, 0.6), 4.0, 2.0)
+    edge = ramp(u, -1.2, 0.9)
+    d = blend_min(d, 0.8 * (d - edge * (cloth + 1.0) + 1.0), 0.7)
+    # the brooch
+    px, py, pz = x + 42.0, y + 32.5, z - 12.0
+    along = -0.35 * px + 0.35 * py + 0.87 * pz
+    out = math.sqrt(max(px * px + py * py + pz * pz - along * along, 0.0) + 0.01)
+    pin = disc(out, along, -6.0, 3.0, 6.0, 1.2) - 0.8 * bump(out, 2.6) + 0.7 * bump(out - 4.4, 0.6)
+    return blend_min(d, pin, 0.8)
 
 
 @kernel
 def _cut(x, y, z):
     """The rounded edge of a classical bust: what lies outside is cut away."""
     side = ellipsoid(x, y, 0.0, 0.0, -22.0, 0.0, 76.0, 74.0, 60.0)
-    return blend_max(side, -z - 44.0, 4.0)
+    return blend_max(side, -z - 49.0, 8.0)
 
 
 @kernel

@@ -82,7 +82,7 @@ def _fringe() -> list[list[float]]:
     for i, azimuth in enumerate(np.linspace(-0.88, 0.88, 13)):
         line = float(np.interp(abs(azimuth), _AZIMUTH, _LINE_Y))
         root = np.array([math.sin(azimuth) * 33.0, line + 9.0 - CENTRE[1], math.cos(azimuth) * 33.0])
-        tip = np.array([math.sin(azimuth) * 34.0, line - 4.5 + 1.2 * (i % 2) - CENTRE[1], math.cos(azimuth) * 41.0])
+        tip = np.array([math.sin(azimuth) * 34.0, line - 3.2 + 1.2 * (i % 2) - CENTRE[1], math.cos(azimuth) * 41.0])
         root, tip = root / np.linalg.norm(root), tip / np.linalg.norm(tip)
         flow = tip - (tip @ root) * root
         side = 1.0 if azimuth > -0.22 else -1.0
@@ -121,7 +121,7 @@ def _lock_heights(directions, above_line, table, out, start, end):
             body = (1.0 - c * c) ** 0.55 * (0.86 + 0.14 * math.cos(table[k, 11] * math.pi * (c - 0.1)))
             rise = 0.5 + 0.5 * s if s > 0 else 0.5 * (1 + s / 0.25)
             thin = min(1.0, max(0.0, (above_line[n] + 6.0) / 16.0))
-            h = 0.8 * mass - 0.6 + high * rise * body * (0.55 + 0.45 * thin)
+            h = 0.8 * mass - 0.6 + high * rise * body * (0.38 + 0.62 * thin)
             g = 0.5 - abs(height - h)
             height = max(height, h) + (g * g * g / 1.5 if g > 0 else 0.0)
         out[n] = height
