@@ -8,6 +8,7 @@ from test_topology import grid, torus
 from test_topology_distance import CUBE_CORNERS, CUBE_FACES, cube
 
 from rangecheck.errors import NotSolid, OutputError
+from rangecheck.export.meshes import write_mesh
 from rangecheck.export.stl import as_float32, write_stl
 from rangecheck.solid import Solid
 from rangecheck.solid.rounding import collapse_flat_faces
@@ -71,3 +72,25 @@ def test_existing_files_and_folders_are_respected(tmp_path):
     (tmp_path / "folder").mkdir()
     with pytest.raises(OutputError, match="is a folder"):
         write_stl(solid, tmp_path / "folder")
+
+
+@pytest.mark.parametrize("suffix", ["ply", "obj", "off", "glb"])
+def test_every_mesh_format_is_read_back_as_the_same_closed_surface(tmp_path, suffix):
+    ring = torus(20, 12)
+    parts = (ring.triangles.mean(axis=1)[:, 0] > 0).astype(np.int32)
+    ring = Surface(
+        ring.vertices, ring.faces, parts, (2 * parts).astype(np.uint8), ("left", 'right "half"'), np.full(len(ring.vertices), 0.1)
+    )
+    path = tmp_path / f"ring.{suffix}"
+    write_mesh(ring, path)
+    first = path.read_bytes()
+    write_mesh(ring, path)
+    assert path.read_bytes() == first
+    back = read_mesh(path, None if suffix == "glb" else "mm")
+    assert topo.is_closed(back) and back.volume_mm3 == pytest.approx(ring.volume_mm3, rel=1e-12 if suffix != "glb" else 1e-5)
+    assert len(back.vertices) == len(ring.vertices)
+
+
+def test_a_mesh_of_unknown_ending_is_refused(tmp_path):
+    with pytest.raises(OutputError, match="a mesh ends in"):
+        write_mesh(cube(), tmp_path / "x.step")

@@ -1,6 +1,21 @@
 """Solids: what a stereolithography printer can build. A `Solid` cannot exist unless every check passed."""
 
-from rangecheck.solid.findings import Finding, Verdict, explain
+from rangecheck.solid.base import choose_base_height, cut_flat
+from rangecheck.solid.findings import Finding, Verdict, explain, finding, verdict
+from rangecheck.solid.relief import close_relief
 from rangecheck.solid.solid import Solid, check_solid
+from rangecheck.solid.untangle import untangle
 
-__all__ = ["Finding", "Solid", "Verdict", "check_solid", "explain"]
+__all__ = [
+    "Finding",
+    "Solid",
+    "Verdict",
+    "check_solid",
+    "choose_base_height",
+    "close_relief",
+    "cut_flat",
+    "explain",
+    "finding",
+    "untangle",
+    "verdict",
+]

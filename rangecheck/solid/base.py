@@ -49,10 +49,10 @@ def cut_flat(solid: Solid, *, height_mm: float, up: npt.ArrayLike = UP) -> Solid
 
 
 def choose_base_height(solid: Solid, *, up: npt.ArrayLike = UP, most_removed: float = 0.35) -> BaseHeight:
-    """The lowest plane above which the sides are measured: below it lies what was invented to close the bottom.
+    """The lowest plane above which the surface is measured: below it lies what was invented to close the bottom.
 
     Walking upwards in 200 levels, the cut is where the invented share of the area, over the next 2 % of the height, first falls
-    below half; at most `most_removed` of the height is given up. A solid without invented faces near its bottom is cut 1 % above it,
+    below 5 %, or if it never does, below half; at most `most_removed` of the height is given up. A solid without invented faces near its bottom is cut 1 % above it,
     which only makes it stand flat."""
     normal = _unit(up)
     surface = solid.surface
@@ -66,13 +66,15 @@ def choose_base_height(solid: Solid, *, up: npt.ArrayLike = UP, most_removed: fl
     total: FloatArray = np.bincount(level, areas, minlength=200).astype(np.float64)
     share = _moving_sum(invented, 4) / np.maximum(_moving_sum(total, 4), 1e-300)
     limit = int(most_removed * 200)
-    mostly_measured = np.flatnonzero(share[: limit + 1] < 0.5)
-    invented_bottom = share[0] >= 0.5
-    if not invented_bottom:
+    clean, mostly = np.flatnonzero(share[: limit + 1] < 0.05), np.flatnonzero(share[: limit + 1] < 0.5)
+    if share[0] < 0.05:
         step, reason = 2, "the bottom is measured; the cut only makes it flat"
-    elif len(mostly_measured):
-        step = int(mostly_measured[0])
-        reason = f"below {low + step / 200 * tall:.1f} mm more than half of the surface is invented"
+    elif len(clean):
+        step = int(clean[0])
+        reason = f"above {low + step / 200 * tall:.1f} mm less than 5 % of the surface is invented"
+    elif len(mostly):
+        step = int(mostly[0])
+        reason = f"above {low + step / 200 * tall:.1f} mm less than half of the surface is invented"
     else:
         step = limit
         reason = f"invented surface reaches above {most_removed:.0%} of the height; no more is given up"

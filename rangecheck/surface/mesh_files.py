@@ -181,4 +181,6 @@ def _through_trimesh(path: Path, content: bytes, kind: str) -> tuple[FloatArray,
     if mesh is None:
         raise InputError(path, "holds no faces; export it again")
     said = "m" if kind == "glb" else _UNITS_3MF.get(str(scene.units or "millimeter").rstrip("s"), "mm")
-    return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64), said
+    # each primitive of GLB brings all vertices of its buffer: keep those that it uses
+    used, faces = np.unique(mesh.faces, return_inverse=True)
+    return np.asarray(mesh.vertices, np.float64)[used], faces.reshape(-1, 3), said

@@ -56,14 +56,21 @@ class EdgeTable:
 _tables: WeakKeyDictionary[Surface, EdgeTable] = WeakKeyDictionary()
 
 
-def edge_table(surface: Surface) -> EdgeTable:
-    """The edges of `surface`, found once and kept as long as the surface lives; linear in the number of faces."""
+def edge_table(surface: Surface | IntArray) -> EdgeTable:
+    """The edges of a surface, found once and kept as long as it lives, or of bare faces (m, 3); linear in the number of faces."""
+    if not isinstance(surface, Surface):
+        faces = np.ascontiguousarray(surface, np.int32).reshape(-1, 3)
+        return _found_edges(faces, int(faces.max(initial=-1)) + 1)
     table = _tables.get(surface)
     if table is None:
-        halves, low, high = sorted_half_edges(surface.faces, len(surface.vertices))
-        ends, start, along, edge_of_half = grouped_half_edges(surface.faces, halves, low, high)
-        table = _tables[surface] = EdgeTable(surface.faces, ends, start, halves, along, edge_of_half)
+        table = _tables[surface] = _found_edges(surface.faces, len(surface.vertices))
     return table
+
+
+def _found_edges(faces: IntArray, vertex_count: int) -> EdgeTable:
+    halves, low, high = sorted_half_edges(faces, vertex_count)
+    ends, start, along, edge_of_half = grouped_half_edges(faces, halves, low, high)
+    return EdgeTable(faces, ends, start, halves, along, edge_of_half)
 
 
 @kernel
@@ -126,21 +133,21 @@ def grouped_half_edges(faces, halves, low, high):
     return ends, start, along, edge_of_half
 
 
-def boundary_edges(surface: Surface) -> IntArray:
+def boundary_edges(surface: Surface | IntArray) -> IntArray:
     """(k, 2) edges with one face, in that face's direction."""
     table = edge_table(surface)
     half = table.halves[table.start[:-1][table.uses == 1]]
     face, side = half // 3, half % 3
-    return np.stack([surface.faces[face, side], surface.faces[face, (side + 1) % 3]], axis=1).astype(np.int32)
+    return np.stack([table.faces[face, side], table.faces[face, (side + 1) % 3]], axis=1).astype(np.int32)
 
 
-def non_manifold_edges(surface: Surface) -> IntArray:
+def non_manifold_edges(surface: Surface | IntArray) -> IntArray:
     """(k, 2) edges with more than two faces."""
     table = edge_table(surface)
     return table.ends[table.uses > 2]
 
 
-def inconsistent_edges(surface: Surface) -> IntArray:
+def inconsistent_edges(surface: Surface | IntArray) -> IntArray:
     """(k, 2) edges whose two faces run the same way along them: one of the two is turned over."""
     table = edge_table(surface)
     return table.ends[(table.uses == 2) & (table.along != 1)]
@@ -375,8 +382,8 @@ def loop_lengths_mm(surface: Surface, loops: list[IntArray]) -> FloatArray:
     )
 
 
-def is_closed(surface: Surface) -> bool:
+def is_closed(surface: Surface | IntArray) -> bool:
     """Whether every edge has exactly two faces, which run opposite ways along it, and no face names a vertex twice."""
     table = edge_table(surface)
-    whole = len(surface.faces) > 0 and len(table.halves) == 3 * len(surface.faces)
+    whole = len(table.faces) > 0 and len(table.halves) == 3 * len(table.faces)
     return whole and bool((table.uses == 2).all() and (table.along == 1).all())
