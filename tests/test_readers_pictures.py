@@ -142,7 +142,7 @@ def header_of(width, height, bits=16, colour=0, data=b""):
         (b"", "is empty"),
         (b"GIF89a" + bytes(64), "it begins with b'GIF89a"),
         (header_of(60000, 60000), "at most"),
-        (header_of(8000, 8000), "is cut short"),
+        (header_of(5000, 5000), "is cut short"),
         (header_of(0, 30), "at least one"),
         (header_of(40, 30, colour=2), "is a colour PNG"),
         (header_of(40, 30, data=bytes(100)), "damaged"),
@@ -187,9 +187,9 @@ def test_missing_files_and_folders_without_scans_are_named(tmp_path):
         read_scans(tmp_path / "no.png")
     with pytest.raises(InputError, match="holds no scans"):
         read_scans(tmp_path)
-    (tmp_path / "notes.txt").write_text("hello")
+    (tmp_path / "notes.md").write_text("hello")
     with pytest.raises(InputError, match="scans are read from"):
-        read_scans(tmp_path / "notes.txt")
+        read_scans(tmp_path / "notes.md")
     write_scans(tmp_path, [some_scan()], step_mm=0.02, manifest="one.json")
     (tmp_path / "two.json").write_text((tmp_path / "one.json").read_text())
     with pytest.raises(InputError, match="2 lists of scans"):

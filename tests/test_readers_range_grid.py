@@ -23,7 +23,7 @@ def fan(seed=0):
     random = np.random.default_rng(seed)
     r, c = np.mgrid[0:ROWS, 0:COLUMNS].astype(float)
     z = 10 * np.cos((c - 25) / 20) * np.cos((r - 20) / 15) + 0.01 * random.normal(size=r.shape)
-    y = 0.7 * (r - 20) + z * (0.1 - 0.006 * r) + 2e-4 * (r - 20) ** 2
+    y = 0.7 * (20 - r) - z * (0.1 - 0.006 * r) + 2e-4 * (r - 20) ** 2
     x = 0.5 * c - 12 + np.where(r % 2 == 0, -0.125, 0.125)
     valid = (np.hypot(r - 20, c - 25) < 18) & (random.random(r.shape) > 0.05)
     index = np.where(valid, np.cumsum(valid).reshape(r.shape) - 1, -1)
@@ -60,6 +60,14 @@ def test_points_are_the_files_vertices_in_millimetres(tmp_path, kind, newline):
         "float32 range, nine digits of text"
     )
     assert np.allclose(scan.brightness[scan.valid], 128 / 255) and scan.unit == "cm" and scan.name == "grid"
+
+
+def test_rows_that_run_upwards_are_turned_over(tmp_path):
+    vertices, index = fan()
+    (tmp_path / "down.ply").write_bytes(ply(vertices, index))
+    (tmp_path / "up.ply").write_bytes(ply(vertices, index[::-1]))
+    down, up = (read_scans(tmp_path / f"{name}.ply", "mm")[0] for name in ("down", "up"))
+    assert (down.valid == up.valid).all() and np.array_equal(down.grid_points_mm, up.grid_points_mm, equal_nan=True)
 
 
 def test_projecting_a_point_along_its_ray_finds_its_cell_and_range(tmp_path):
@@ -127,7 +135,7 @@ def test_a_grid_without_vertices_and_a_mesh_are_refused(tmp_path):
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (9, 1), (2, 2), (3, 1)])
 def test_grids_of_one_row_or_column_are_read(tmp_path, shape):
     r, c = np.indices(shape)
-    vertices = np.stack([c * 0.5, r * 0.7, np.zeros(shape)], axis=-1).reshape(-1, 3)
+    vertices = np.stack([c * 0.5, -r * 0.7, np.zeros(shape)], axis=-1).reshape(-1, 3)
     (tmp_path / "g.ply").write_bytes(ply(vertices, np.arange(r.size).reshape(shape)))
     (scan,) = read_scans(tmp_path / "g.ply", "mm")
     assert np.abs(scan.points_mm() - vertices).max() < 1e-5

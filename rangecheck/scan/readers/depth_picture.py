@@ -10,11 +10,18 @@ import numpy.typing as npt
 
 from rangecheck.errors import InputError
 from rangecheck.files import read_bytes
-from rangecheck.scan.readers import depth_png
+from rangecheck.scan.readers import depth_exr, depth_pfm, depth_png, depth_tiff
 
-_DECODERS: dict[bytes, tuple[Callable[[Path], npt.NDArray[Any]], tuple[str, ...]]] = {
-    depth_png.SIGNATURE: (depth_png.read_png, (".png",)),
-}
+Decoder = Callable[[Path], npt.NDArray[Any]]
+#: first bytes, decoder, endings
+_DECODERS: tuple[tuple[tuple[bytes, ...], Decoder, tuple[str, ...]], ...] = (
+    ((depth_png.SIGNATURE,), depth_png.read_png, (".png",)),
+    (depth_tiff.MAGIC, depth_tiff.read_tiff, (".tif", ".tiff")),
+    ((depth_exr.MAGIC,), depth_exr.read_exr, (".exr",)),
+    (depth_pfm.MAGIC, depth_pfm.read_pfm, (".pfm",)),
+)
+ENDINGS = tuple(ending for _, _, endings in _DECODERS for ending in endings)
+MAGIC = {ending: magic for magic, _, endings in _DECODERS for ending in endings}
 
 
 def read_picture(path: Path, expect: tuple[int, int]) -> npt.NDArray[Any]:
@@ -22,10 +29,9 @@ def read_picture(path: Path, expect: tuple[int, int]) -> npt.NDArray[Any]:
 
     Raises InputError when the file is missing, is not what its ending says, is damaged, or has another size."""
     head = read_bytes(path, 16)
-    fitting = [entry for magic, entry in _DECODERS.items() if head.startswith(magic)]
+    fitting = [(decode, endings) for magic, decode, endings in _DECODERS if head.startswith(magic)]
     if not fitting:
-        known = sorted({ending for _, endings in _DECODERS.values() for ending in endings})
-        raise InputError(path, f"is not a picture of distances; its first bytes fit none of {', '.join(known)}")
+        raise InputError(path, f"is not a picture of distances; its first bytes fit none of {', '.join(ENDINGS)}")
     decode, endings = fitting[0]
     if path.suffix.lower() not in endings:
         raise InputError(path, f"holds a {endings[0][1:].upper()} picture and ends in {path.suffix or 'nothing'}; rename it")

@@ -2,15 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from rangecheck.arrays import mm_per
-from rangecheck.errors import InputError
+from rangecheck.errors import InputError, UnitMissing
 from rangecheck.files import read_bytes
+from rangecheck.scan.point_cloud import PointCloud
 from rangecheck.scan.range_scan import RangeScan
-from rangecheck.scan.readers import conf, depth_png, manifest, npz, ply, range_grid_ply
+from rangecheck.scan.readers import (
+    camera_ply,
+    conf,
+    cyberware,
+    depth_picture,
+    e57,
+    manifest,
+    npz,
+    pcd,
+    ply,
+    ptx,
+    range_grid_ply,
+    xyz,
+)
+
+Measured = RangeScan | PointCloud
 
 
 @dataclass(frozen=True)
@@ -20,15 +36,39 @@ class Format:
     name: str
     endings: tuple[str, ...]
     magic: tuple[bytes, ...]
-    read: Callable[[Path, str | None], list[RangeScan]]
+    read: Callable[[Path, str | None], Sequence[Measured]]
+    #: whether files of this kind in a folder are scans; notes and tables end like lists of points
+    in_folders: bool = True
+
+
+def _read_ply(path: Path, unit: str | None) -> Sequence[Measured]:
+    """A range grid, a triangulated range map with its camera, or a cloud; a mesh is refused."""
+    content = ply.read_ply(path)
+    if unit is None:
+        raise UnitMissing(path)
+    if "range_grid" in content.elements:
+        return [range_grid_ply.scan_of_grid(content, unit)]
+    if "camera" in content.elements:
+        return camera_ply.scan_of_range_map(content, unit)
+    if content.elements.get("face", content.elements.get("tristrips")) is not None:
+        raise InputError(
+            path, "is a mesh without a camera, not a range scan; check it as a mesh, or export the scanner's own files"
+        )
+    return xyz.read_ply_cloud(content, unit)
 
 
 FORMATS = (
-    Format("depth PNG", (".png",), (depth_png.SIGNATURE,), manifest.read_lone_picture),
+    *(Format("depth picture", (e,), m, manifest.read_lone_picture) for e, m in depth_picture.MAGIC.items()),
     Format("manifest", (".json",), (), manifest.read_manifest),
     Format("NumPy archive", (".npz",), (npz.MAGIC,), npz.read_npz),
-    Format("PLY", (".ply",), (ply.MAGIC,), range_grid_ply.read_range_grid),
+    Format("PLY", (".ply",), (ply.MAGIC,), _read_ply),
     Format("placement list", (".conf",), (), conf.read_conf),
+    Format("PCD", (".pcd",), (), pcd.read_pcd),
+    Format("PTX", (".ptx",), (), ptx.read_ptx),
+    Format("E57", (".e57",), (e57.MAGIC,), e57.read_e57),
+    Format("Cyberware echo", (".cyb", ".cy", ".echo"), (cyberware.MAGIC,), cyberware.read_cyberware),
+    Format("list of points", (".xyz",), (), xyz.read_xyz),
+    Format("list of points", (".txt", ".asc", ".csv"), (), xyz.read_xyz, in_folders=False),
 )
 
 
@@ -38,14 +78,30 @@ def read_scans(path: str | Path, unit: str | None = None) -> list[RangeScan]:
     unit  mm, cm, m, um or in; needed where the file does not say its unit (UnitMissing), refused where it says another
 
     A folder is read through its manifest (the one JSON file that lists scans) or its one `.conf`; else file by file in the order
-    of their names, a depth picture through the JSON file beside it. Raises InputError in one line when something is missing, damaged or not what it says; the first problem ends
-    the reading, so nothing is left out silently."""
+    of their names, a depth picture through the JSON file beside it. Raises InputError in one line when something is missing,
+    damaged or not what it says, or is a cloud without a grid (`read_measured` takes those); the first problem ends the reading, so
+    nothing is left out silently."""
+    scans = []
+    for item in read_measured(path, unit):
+        if not isinstance(item, RangeScan):
+            raise InputError(
+                path,
+                f"{item.name} is {len(item.points_mm)} points without a grid or a place they were seen from, so neighbours, free space "
+                "and viewing angles are unknown; only methods that take clouds can use it (poisson)",
+                points=len(item.points_mm),
+            )
+        scans.append(item)
+    return scans
+
+
+def read_measured(path: str | Path, unit: str | None = None) -> list[Measured]:
+    """As `read_scans`, with point clouds among the results where a file holds no grid."""
     path = Path(path)
     if unit is not None:
         mm_per(unit)
     if path.is_dir():
         return _read_folder(path, unit)
-    return _format_of(path).read(path, unit)
+    return list(_format_of(path).read(path, unit))
 
 
 def _format_of(path: Path) -> Format:
@@ -65,7 +121,7 @@ def _format_of(path: Path) -> Format:
     raise InputError(path, f"is named like {fitting[0].name}, but {told}; correct its name or its content")
 
 
-def _read_folder(folder: Path, unit: str | None) -> list[RangeScan]:
+def _read_folder(folder: Path, unit: str | None) -> list[Measured]:
     files = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
     described = {p: manifest.pictures_of(p) for p in files if p.suffix.lower() == ".json"}
     leading = [p for p, pictures in described.items() if pictures is None] or [p for p in files if p.suffix.lower() == ".conf"]
@@ -73,12 +129,12 @@ def _read_folder(folder: Path, unit: str | None) -> list[RangeScan]:
         names = ", ".join(p.name for p in leading[:4])
         raise InputError(folder, f"holds {len(leading)} lists of scans ({names}); name the one to read", count=len(leading))
     if leading:
-        return read_scans(leading[0], unit)
+        return read_measured(leading[0], unit)
     covered = {name for pictures in described.values() for name in pictures or ()}
-    endings = {ending for f in FORMATS for ending in f.endings}
+    endings = {ending for f in FORMATS if f.in_folders for ending in f.endings}
     wanted = [
         p for p in files if p.suffix.lower() in endings and p.name not in covered and (p not in described or bool(described[p]))
     ]
     if not wanted:
         raise InputError(folder, f"holds no scans among its {len(files)} files; scans end in {', '.join(sorted(endings))}")
-    return [scan for p in wanted for scan in read_scans(p, unit)]
+    return [scan for p in wanted for scan in read_measured(p, unit)]

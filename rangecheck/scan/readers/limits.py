@@ -10,8 +10,8 @@ from pathlib import Path, PurePosixPath
 
 from rangecheck.errors import InputError
 
-#: cells of one scan: 8192 x 8192
-MAX_CELLS = 1 << 26
+#: cells of one scan: 8192 x 4096
+MAX_CELLS = 1 << 25
 #: deflate cannot shrink more than this (RFC 1951: 258 bytes from 2 bits), so neither can a PNG, a zip or a TIFF
 DEFLATE_RATIO = 1032
 

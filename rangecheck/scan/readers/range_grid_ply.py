@@ -1,7 +1,8 @@
 """Stanford range-grid PLY (Cyberware, 1994-96): a grid of columns and rows whose cells list no vertex or one.
 
 File frame: x right, y up, z towards the scanner; the scan frame (x right, y down, z forward) starts on a plane 100 mm in front of
-the nearest vertex, and `world_from_scan` leads back to the file's frame, in mm. The file does not say its unit.
+the nearest vertex, and `world_from_scan` leads back to the file's frame, in mm. The first row of the scan is the top one, whichever
+comes first in the file. The file does not say its unit.
 
 Such a scanner sweeps a sheet of light along x while a camera beside it looks along it: columns stand at steady x (rows may be
 interlaced by a fraction of a column), and the camera's rows fan out, so that a row's y depends on z. A row's rays share one direction,
@@ -43,6 +44,8 @@ def scan_of_grid(ply: Ply, unit: str) -> RangeScan:
     path = ply.path
     vertex = ply.need("vertex", "x", "y", "z")
     index, valid = _grid(ply)
+    if _rises(vertex.columns["y"], index):
+        index, valid = index[::-1], valid[::-1].copy()
     points = np.stack([vertex.columns[axis] for axis in "xyz"], axis=1).astype(np.float64)[index[valid]] * mm_per(unit)
     finite = np.isfinite(points).all(axis=1)
     valid[valid] = finite
@@ -85,6 +88,12 @@ def _grid(ply: Ply) -> tuple[IntArray, BoolArray]:
     flat[lengths == 1] = items.astype(np.int64)
     index = flat.reshape(height, width)
     return index, index >= 0
+
+
+def _rises(y: FloatArray, index: IntArray) -> bool:
+    """Whether rows run upwards in the file's frame, y up; scans keep their first row on top."""
+    both = (index[1:] >= 0) & (index[:-1] >= 0)
+    return float((y[index[1:][both]].astype(np.float64) - y[index[:-1][both]]).sum()) > 0
 
 
 def _rays(grid: FloatArray, valid: BoolArray) -> tuple[FloatArray, FloatArray]:

@@ -114,9 +114,9 @@ def parse_numbers(
     what     for the message when too few are there
 
     Raises InputError with the line of the first token that is no number."""
-    decimal, separator = _commas(path, text, start)
+    decimal, separator = punctuation(path, text, start)
     size = len(text) - start
-    most = (size + 1) // 2
+    most = (size + 1) // 2 + 1  # one more than fit, so that the last line end is seen too
     room = most if count is None else min(count, most)
     out = np.empty(room)
     hard = np.empty((min(room, _MAX_HARD) + 1, 3), np.int64)
@@ -153,7 +153,7 @@ def _line(text: bytes, position: int) -> int:
     return text.count(b"\n", 0, position) + 1
 
 
-def _commas(path: Path, text: bytes, start: int) -> tuple[int, int]:
+def punctuation(path: Path, text: bytes, start: int) -> tuple[int, int]:
     """Decimal mark and separator besides white space. A comma is the decimal mark when the file has no point, and each comma
     stands alone between digits of one word; else it separates; `1.234,5` with both in one number is refused."""
     if text.find(b",", start) < 0:
