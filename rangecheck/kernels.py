@@ -22,6 +22,10 @@ kernel = numba.njit(cache=True, error_model="numpy", nogil=True)
 #: the same, but pasted into its callers: for a few lines that are called billions of times
 inline_kernel = numba.njit(cache=True, error_model="numpy", nogil=True, inline="always")
 
+#: the same, for kernels that create no arrays: without them numba need not count references, which in a loop over rays that hands
+#: arrays to smaller kernels costs more than the work itself
+stage_kernel = numba.njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+
 T = TypeVar("T")
 _threads = 0
 

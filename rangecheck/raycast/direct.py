@@ -17,7 +17,7 @@ from typing import Any
 
 import numba
 import numpy as np
-from llvmlite import ir
+from llvmlite import ir  # type: ignore[import-untyped]
 from numba import types
 from numba.extending import intrinsic
 
@@ -121,9 +121,9 @@ class DirectScene:
         library.rtcSetSceneFlags(self._scene, _ROBUST)
         geometry = library.rtcNewGeometry(device, _TRIANGLES)
         for kind, form, values in ((_VERTEX_BUFFER, _FLOAT3, vertices), (_INDEX_BUFFER, _UINT3, faces)):
-            values = np.ascontiguousarray(values)
-            place = library.rtcSetNewGeometryBuffer(geometry, kind, 0, form, 12, len(values))
-            ctypes.memmove(place, values.ctypes.data, values.nbytes)
+            content = np.ascontiguousarray(values)
+            place = library.rtcSetNewGeometryBuffer(geometry, kind, 0, form, 12, len(content))
+            ctypes.memmove(place, content.ctypes.data, content.nbytes)
         library.rtcCommitGeometry(geometry)
         library.rtcAttachGeometry(self._scene, geometry)
         library.rtcReleaseGeometry(geometry)
