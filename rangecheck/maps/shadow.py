@@ -13,10 +13,11 @@ import numpy.typing as npt
 from rangecheck.arrays import BoolArray, FloatArray, IntArray, require, unit_vectors
 from rangecheck.errors import ArrayError
 from rangecheck.kernels import in_chunks
-from rangecheck.maps.secondary import SKIN, barycentric
+from rangecheck.maps.secondary import SKIN
 from rangecheck.maps.trace import PIXELS_PER_CHUNK, Caster, Maps
 from rangecheck.raycast import EmbreeCaster
 from rangecheck.surface import Surface
+from rangecheck.surface.attributes import barycentric
 
 NOTHING, LIT, TURNED_AWAY, SHADED = 0, 1, 2, 3
 STATE_NAMES = ("nothing seen", "lit", "turned away", "shaded")
