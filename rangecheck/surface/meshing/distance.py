@@ -1,0 +1,191 @@
+"""Signed distance to what the scans saw, at any set of points (Curless & Levoy 1996), positive outside. Millimetres.
+
+A view's distance at a point is the gap between the point and the view's surface along the ray, turned into the distance to the
+tangent plane there; views are averaged with their weights. Between four cells the surface is the blend of their local planes at
+half slope, which is exact for quadratics. Where the four disagree there is a depth jump, and the view says nothing.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from rangecheck.arrays import FloatArray, IntArray
+from rangecheck.kernels import in_chunks, inline_kernel, kernel
+from rangecheck.surface.meshing.projection import project
+from rangecheck.surface.meshing.views import Views
+
+#: what is known at a point
+UNKNOWN, FREE, SEEN = 0, 1, 2
+BLOCK = 8
+CORNERS = BLOCK**3
+#: four cells whose surfaces differ by more than this many pitches (or six standard errors) lie across a depth jump
+JUMP_PITCHES = 2.0
+
+
+@inline_kernel
+def look(cells, start, height, width, u, v, r):
+    """(state, distance, weight, normal) of one view at a point that projects to u, v with range r.
+
+    state: -1 nothing known, 0 free space reaches beyond every limit (the ray met nothing), 1 a surface at `distance` (signed)."""
+    state = -1
+    distance = weight = nx = ny = nz = 0.0
+    if r > 0.0 and -0.5 < u < width - 0.5 and -0.5 < v < height - 0.5:
+        c0, r0 = math.floor(u), math.floor(v)
+        s, t = u - c0, v - r0
+        total = empty = value = cosine = 0.0
+        low, high = np.inf, -np.inf
+        slope = 0.0
+        for k in range(4):
+            dc, dr = k & 1, k >> 1
+            col, row = c0 + dc, r0 + dr
+            part = (s if dc else 1.0 - s) * (t if dr else 1.0 - t)
+            if not (0 <= col < width and 0 <= row < height):
+                continue
+            cell = start + row * width + col
+            here = cells[cell, 0]
+            if math.isinf(here):
+                empty += part
+            elif here == here and part > 0.0:
+                lean = cells[cell, 1] * (u - col) + cells[cell, 2] * (v - row)
+                ahead = here + lean
+                low, high = min(low, ahead + lean), max(high, ahead + lean)
+                slope = max(slope, abs(cells[cell, 1]), abs(cells[cell, 2]))
+                total += part
+                value += part * ahead
+                weight += part * cells[cell, 3]
+                nx += part * cells[cell, 4]
+                ny += part * cells[cell, 5]
+                nz += part * cells[cell, 6]
+                cosine += part * cells[cell, 7]
+        if total > 0.999 or (total >= 0.5 and empty == 0.0):
+            value /= total
+            cosine /= total
+            # the sign of a gap wider than this is certain even across a jump: the point lies before every surface
+            if high - low > 0.5 + slope:
+                if r < low - 1.0:
+                    state, distance, weight = 1, low - r, 0.0
+                elif r > high + 1.0:
+                    state, distance, weight = 1, high - r, 0.0
+            else:
+                state, distance = 1, (value - r) * cosine
+        elif empty > 0.999:
+            state = 0
+        elif total > 0.0 and total + empty > 0.999 and r < low - 1.0:
+            state, distance, weight = 1, low - r, 0.0
+    return state, distance, weight, nx, ny, nz
+
+
+@kernel
+def fuse_point(kind, numbers, size, start, cells, x, y, z, before_mm, behind_mm):
+    """State, distance, weight (0 where no view is near), and the soft distance: the nearest view's when none is within reach."""
+    total = weighted = 0.0
+    free = False
+    soft = -np.inf
+    for s in range(len(kind)):
+        u, v, r = project(kind[s], numbers[s], x, y, z)
+        state, d, w, _, _, _ = look(cells, start[s], size[s, 0], size[s, 1], u, v, r)
+        if state < 0:
+            continue
+        if state == 0 or d > before_mm:
+            free = True
+        elif d >= -behind_mm:
+            if w > 0.0:
+                # behind the surface the weight falls: what lies there may be another side of something thin
+                w *= 1.0 if d > -0.4 * behind_mm else (d + behind_mm) / (0.6 * behind_mm) + 1e-3
+                total += w
+                weighted += w * d
+        else:
+            soft = max(soft, d)
+    if total > 0.0:
+        return SEEN, weighted / total, total
+    if free:
+        return FREE, before_mm, 0.0
+    return UNKNOWN, soft, 0.0
+
+
+@kernel
+def _fill_blocks(kind, numbers, size, start, cells, origins, step, before_mm, behind_mm, first, last, field, weight, state):
+    for b in range(first, last):
+        corner = 0
+        for k in range(BLOCK):
+            z = origins[b, 2] + k * step
+            for j in range(BLOCK):
+                y = origins[b, 1] + j * step
+                for i in range(BLOCK):
+                    x = origins[b, 0] + i * step
+                    what, d, w = fuse_point(kind, numbers, size, start, cells, x, y, z, before_mm, behind_mm)
+                    field[b, corner], weight[b, corner], state[b, corner] = d, w, what
+                    corner += 1
+
+
+def fill_blocks(
+    views: Views, origins_mm: FloatArray, step_mm: float, before_mm: float, behind_mm: float
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Field, weight (n, 512) float32 and state (n, 512) uint8 at the corners of n blocks of 8 x 8 x 8, x fastest.
+
+    `before_mm`, `behind_mm`: how far before and behind a surface its distance counts. Unknown corners hold the soft distance:
+    how far behind the last surface they lie, or -inf."""
+    n = len(origins_mm)
+    field, weight = np.empty((n, CORNERS), np.float32), np.empty((n, CORNERS), np.float32)
+    state = np.empty((n, CORNERS), np.uint8)
+    in_chunks(
+        lambda i, j: _fill_blocks(*views.arrays, origins_mm, step_mm, before_mm, behind_mm, i, j, field, weight, state), n, 64
+    )
+    return field, weight, state
+
+
+@kernel
+def _settle(kind, numbers, size, start, cells, points, normals, reach_mm, steps, low, high, first, last, error, looks):
+    """Move points onto the averaged surface by Newton steps along its normal, kept inside their boxes."""
+    for i in range(first, last):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        gx, gy, gz = normals[i, 0], normals[i, 1], normals[i, 2]
+        total = 0.0
+        for _ in range(steps):
+            total = sum_d = mx = my = mz = 0.0
+            n = 0
+            for s in range(len(kind)):
+                u, v, r = project(kind[s], numbers[s], x, y, z)
+                state, d, w, nx, ny, nz = look(cells, start[s], size[s, 0], size[s, 1], u, v, r)
+                if state != 1 or w <= 0.0 or abs(d) > reach_mm:
+                    continue
+                length = math.sqrt(nx * nx + ny * ny + nz * nz)
+                agree = (nx * gx + ny * gy + nz * gz) / length
+                if agree < 0.3:
+                    continue
+                w *= agree
+                # a view farther off than its errors explain is another surface or a bad pose: it counts less (Cauchy)
+                total += w
+                sum_d += w * d
+                mx, my, mz = mx + w * nx / length, my + w * ny / length, mz + w * nz / length
+                n += 1
+            if n == 0:
+                break
+            length = math.sqrt(mx * mx + my * my + mz * mz)
+            gx, gy, gz = mx / length, my / length, mz / length
+            d = sum_d / total
+            x = min(max(x - d * gx, low[i, 0]), high[i, 0])
+            y = min(max(y - d * gy, low[i, 1]), high[i, 1])
+            z = min(max(z - d * gz, low[i, 2]), high[i, 2])
+            looks[i] = n
+        if total > 0.0:
+            error[i] = math.sqrt(1.0 / total)
+            points[i, 0], points[i, 1], points[i, 2] = x, y, z
+            normals[i, 0], normals[i, 1], normals[i, 2] = gx, gy, gz
+
+
+def settle(
+    views: Views, points_mm: FloatArray, normals: FloatArray, reach_mm: float, low: FloatArray, high: FloatArray, steps: int = 2
+) -> tuple[FloatArray, IntArray]:
+    """Move `points_mm` (n, 3), in place, onto the surface that the views average to, inside the boxes low..high (n, 3).
+
+    Returns (n,) standard error in mm from the views' weights (inf where no view is within `reach_mm`) and (n,) number of views."""
+    error, looks = np.full(len(points_mm), np.inf), np.zeros(len(points_mm), np.int32)
+    in_chunks(
+        lambda i, j: _settle(*views.arrays, points_mm, normals, reach_mm, steps, low, high, i, j, error, looks),
+        len(points_mm),
+        8192,
+    )
+    return error, looks

@@ -1,0 +1,137 @@
+"""Volumetric fusion: several posed scans become one closed surface (Curless & Levoy 1996).
+
+World frame, millimetres. Steps: local fits in each scan's own grid; their signed distances averaged at the corners of a sparse
+grid; space that a ray was seen to cross is outside; what nobody saw is closed by a membrane; the zero set as a dual mesh, closed
+and manifold by construction; its vertices settled onto the average of the scans' local surfaces, which beats the grid's step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from rangecheck.arrays import BoolArray, FloatArray, IntArray
+from rangecheck.errors import SettingError, SurfaceError
+from rangecheck.scan import RangeScan
+from rangecheck.surface.meshing.blocks import Grid, add_blocks, box_for, grid_near, missing_blocks, part_touching
+from rangecheck.surface.meshing.closing import coarse_field, fill_open, smooth_open
+from rangecheck.surface.meshing.distance import fill_blocks, settle
+from rangecheck.surface.meshing.extract import MARGIN, split_quads, zero_set
+from rangecheck.surface.meshing.samples import distance_to_samples, label_faces, sample_grid
+from rangecheck.surface.meshing.shells import shell_of_vertex, shells_to_keep
+from rangecheck.surface.meshing.views import Views, views_of
+from rangecheck.surface.surface import MEASURED, Surface
+
+#: step of the grid in median sample spacings
+VOXEL_IN_SPACINGS = 1.25
+#: how far before and behind a surface its distance is used, in steps of the grid
+BEFORE_STEPS, BEHIND_STEPS = 2.5, 2.5
+#: default thresholds of the labels, in median sample spacings
+MEASURED_IN_SPACINGS, INTERPOLATED_IN_SPACINGS = 2.0, 6.0
+#: shells with less than this share of the largest shell's measured area are floating bits
+LEAST_SHELL = 0.02
+#: expected error of invented surface as a share of the distance to the nearest sample
+INVENTED_ERROR = 0.3
+OPEN_SWEEPS = 12
+
+
+def fuse(
+    scans: Sequence[RangeScan],
+    *,
+    voxel_mm: float | None = None,
+    measured_mm: float | None = None,
+    interpolated_mm: float | None = None,
+    least_shell: float = LEAST_SHELL,
+) -> Surface:
+    """One closed, outward-oriented 2-manifold from posed scans.
+
+    voxel_mm         step of the grid; by default VOXEL_IN_SPACINGS times the median distance between neighbouring samples
+    measured_mm      a face with a sample this near to its centroid is measured (default 2 sample spacings)
+    interpolated_mm  one with a sample this near is interpolated (default 6 spacings); the rest is invented
+    least_shell      shells with less than this share of the largest shell's measured area are dropped
+
+    Raises ScanError for scans without a surface or cameras that cannot be projected into, SettingError for a bad setting."""
+    for name, value in (("voxel_mm", voxel_mm), ("measured_mm", measured_mm), ("interpolated_mm", interpolated_mm)):
+        if value is not None and not (np.isfinite(value) and value > 0):
+            raise SettingError(f"{name} is {value}; it must be a positive number of millimetres", key=name)
+    views = views_of(scans)
+    step = voxel_mm or VOXEL_IN_SPACINGS * views.spacing_mm
+    measured = measured_mm or MEASURED_IN_SPACINGS * views.spacing_mm
+    interpolated = max(interpolated_mm or INTERPOLATED_IN_SPACINGS * views.spacing_mm, measured)
+    grid, coarse = _grid_of_distances(views, step)
+    points, normals, low, seen, quads = zero_set(grid, coarse)
+    if len(quads) == 0:
+        raise SurfaceError("the scans' distances have no zero set; check their poses and unit, or choose a smaller voxel_mm")
+    error = _settle(views, points, normals, low, seen, step)
+    faces = split_quads(points, quads)
+    nearby = sample_grid(views.samples_mm, measured)
+    origin = label_faces(nearby, points, faces, measured, interpolated)
+    points, faces, origin, error = _without_floating_bits(points, faces, origin, error, least_shell)
+    unseen = ~np.isfinite(error)
+    reach = float(np.linalg.norm(np.ptp(points, axis=0)))
+    error[unseen] = INVENTED_ERROR * distance_to_samples(nearby, points[unseen], reach)
+    return Surface(points + views.shift_mm, faces, origin_of_face=origin, vertex_error_mm=error)
+
+
+def _grid_of_distances(views: Views, step: float) -> tuple[Grid, FloatArray]:
+    """The sparse grid, filled, closed and free of touching sheets, and the coarse field around it."""
+    origin, shape = box_for(views.samples_mm, step)
+    coarse, _ = coarse_field(views, origin, shape, step)
+    grid = grid_near(views.samples_mm, origin, shape, step, BEFORE_STEPS * step, _crossed(coarse))
+    _fill(views, grid, coarse, 0)
+    smooth_open(grid, OPEN_SWEEPS)
+    while True:
+        more = missing_blocks(grid, coarse)
+        if len(more):
+            before = len(grid.place)
+            add_blocks(grid, more)
+            _fill(views, grid, coarse, before)
+        elif part_touching(grid, coarse) == 0:
+            return grid, coarse
+
+
+def _fill(views: Views, grid: Grid, coarse: FloatArray, first: int) -> None:
+    rows = slice(first, len(grid.place))
+    before, behind = BEFORE_STEPS * grid.step_mm, BEHIND_STEPS * grid.step_mm
+    grid.field[rows], grid.weight[rows], grid.state[rows] = fill_blocks(
+        views, grid.corner_origins(rows), grid.step_mm, before, behind
+    )
+    fill_open(grid, coarse, rows)
+
+
+def _crossed(coarse: FloatArray) -> BoolArray:
+    """(bx, by, bz) True: blocks whose 27 coarse nodes differ in sign."""
+    inside = coarse < 0
+    some, every = inside, inside
+    for axis in range(3):
+        parts = [np.take(some, range(k, some.shape[axis] - 2 + k, 2), axis=axis) for k in range(3)]
+        some = parts[0] | parts[1] | parts[2]
+        parts = [np.take(every, range(k, every.shape[axis] - 2 + k, 2), axis=axis) for k in range(3)]
+        every = parts[0] & parts[1] & parts[2]
+    return some & ~every
+
+
+def _settle(views: Views, points: FloatArray, normals: FloatArray, low: FloatArray, seen: BoolArray, step: float) -> FloatArray:
+    """Settle the vertices that come from measured distances; returns (n,) standard error in mm, inf for the others."""
+    error = np.full(len(points), np.inf)
+    chosen = np.flatnonzero(seen)
+    moved, directions = points[chosen], normals[chosen]
+    box_low, box_high = low[chosen] + MARGIN * step, low[chosen] + (1 - MARGIN) * step
+    error[chosen], _ = settle(views, moved, directions, 1.5 * step, box_low, box_high)
+    points[chosen], normals[chosen] = moved, directions
+    return error
+
+
+def _without_floating_bits(
+    points: FloatArray, faces: IntArray, origin: IntArray, error: FloatArray, least_share: float
+) -> tuple[FloatArray, IntArray, IntArray, FloatArray]:
+    shell = shell_of_vertex(faces, len(points))
+    if len(shell) == 0 or shell.max() == 0:
+        return points, faces, origin, error
+    a, b, c = (points[faces[:, corner]] for corner in range(3))
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    keep = np.isin(shell, shells_to_keep(shell[faces[:, 0]], area, origin == MEASURED, least_share))
+    number = np.cumsum(keep) - 1
+    kept = keep[faces[:, 0]]
+    return points[keep], number[faces[kept]].astype(np.int32), origin[kept], error[keep]

@@ -1,0 +1,46 @@
+"""Connected shells of a triangle mesh, and which of them to keep."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rangecheck.arrays import FloatArray, IntArray
+from rangecheck.kernels import kernel
+
+
+@kernel
+def _join(faces, parent):
+    for f in range(len(faces)):
+        a = faces[f, 0]
+        while parent[a] != a:
+            parent[a] = parent[parent[a]]
+            a = parent[a]
+        for corner in range(1, faces.shape[1]):
+            b = faces[f, corner]
+            while parent[b] != b:
+                parent[b] = parent[parent[b]]
+                b = parent[b]
+            if a < b:
+                parent[b] = a
+            elif b < a:
+                parent[a] = b
+                a = b
+    for v in range(len(parent)):
+        # every parent is lower than its child, so one ascending pass flattens the trees
+        parent[v] = parent[parent[v]]
+
+
+def shell_of_vertex(faces: IntArray, count: int) -> IntArray:
+    """(n,) int32 number of the shell of each vertex, shells numbered by their lowest vertex; faces (m, 3) or (m, 4)."""
+    parent = np.arange(count, dtype=np.int32)
+    _join(faces, parent)
+    return np.unique(parent, return_inverse=True)[1].astype(np.int32) if count else parent
+
+
+def shells_to_keep(shell_of_face: IntArray, area_mm2: FloatArray, trusted: IntArray, least_share: float) -> IntArray:
+    """Numbers of the shells whose trusted area (faces where `trusted`) is at least `least_share` of the largest shell's."""
+    shells = int(shell_of_face.max()) + 1 if len(shell_of_face) else 0
+    area = np.bincount(shell_of_face, area_mm2 * trusted, minlength=shells)
+    if not area.any():
+        area = np.bincount(shell_of_face, area_mm2, minlength=shells)
+    return np.flatnonzero(area >= least_share * area.max(initial=0.0))

@@ -1,0 +1,203 @@
+"""The scans as numbers that compiled kernels understand: projection, local fits, normals and weights, one record per cell.
+
+Frame: the world frame shifted so that the middle of the samples is the origin; `Views.shift_mm` undoes it. Millimetres.
+A cell's record holds the range of its local fit, half its slopes, its weight (1 / variance along the normal, feathered to
+zero at the edge of what the scan saw, Curless & Levoy 1996), its normal in the world frame, and |ray . normal|.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rangecheck import rigid
+from rangecheck.arrays import FloatArray, IntArray
+from rangecheck.errors import ScanError
+from rangecheck.kernels import in_chunks, kernel
+from rangecheck.optics import Camera
+from rangecheck.scan import RangeScan
+from rangecheck.surface.meshing.local_fit import BEND_TAN, quiet_ranges
+from rangecheck.surface.meshing.projection import project, projection_of
+
+#: numbers per cell: range, half u slope, half v slope, weight, normal x y z, |ray . normal|
+RANGE, HALF_U, HALF_V, WEIGHT, NORMAL, COSINE, FIELDS = 0, 1, 2, 3, 4, 7, 8
+#: cells over which the weight rises from the edge of what a scan saw
+FEATHER_CELLS = 4.0
+#: cells seen at a flatter angle than this carry no weight
+FLATTEST_COSINE = 0.1
+
+
+@dataclass(frozen=True)
+class Views:
+    """All scans, concatenated.
+
+    kind (s,) int64; numbers (s, 37) pose and camera; size (s, 2) int64 height, width; start (s,) int64 first cell of each scan;
+    cells (n, 8) float32 records: range is NaN where nothing is known and +inf where the ray met nothing;
+    noise_mm (n,) float32 standard deviation of one range; samples_mm (k, 3) valid samples, shifted world frame;
+    spacing_mm median distance between neighbouring samples along the surface; shift_mm (3,)."""
+
+    kind: IntArray
+    numbers: FloatArray
+    size: IntArray
+    start: IntArray
+    cells: FloatArray
+    noise_mm: FloatArray
+    samples_mm: FloatArray
+    spacing_mm: float
+    shift_mm: FloatArray
+
+    @property
+    def arrays(self) -> tuple[IntArray, FloatArray, IntArray, IntArray, FloatArray]:
+        """What the kernels take first: kind, numbers, size, start, cells."""
+        return self.kind, self.numbers, self.size, self.start, self.cells
+
+
+@kernel
+def _records(fit, origins, directions, rotation, edge, first, last, cells):
+    """Fill the records of rows first..last from the local fits."""
+    height, width = fit.shape[0], fit.shape[1]
+    for row in range(first, last):
+        r0, r1 = max(row - 1, 0), min(row + 1, height - 1)
+        for col in range(width):
+            i = row * width + col
+            cells[i, :] = 0.0
+            cells[i, 0] = np.nan
+            r = float(fit[row, col, 0])
+            if not math.isfinite(r):
+                continue
+            c0, c1 = max(col - 1, 0), min(col + 1, width - 1)
+            du, dv = 1.0 / (c1 - c0), 1.0 / (r1 - r0)
+            d = directions[row, col]
+            pu0 = (origins[row, c1, 0] - origins[row, c0, 0] + r * (directions[row, c1, 0] - directions[row, c0, 0])) * du
+            pu1 = (origins[row, c1, 1] - origins[row, c0, 1] + r * (directions[row, c1, 1] - directions[row, c0, 1])) * du
+            pu2 = (origins[row, c1, 2] - origins[row, c0, 2] + r * (directions[row, c1, 2] - directions[row, c0, 2])) * du
+            pv0 = (origins[r1, col, 0] - origins[r0, col, 0] + r * (directions[r1, col, 0] - directions[r0, col, 0])) * dv
+            pv1 = (origins[r1, col, 1] - origins[r0, col, 1] + r * (directions[r1, col, 1] - directions[r0, col, 1])) * dv
+            pv2 = (origins[r1, col, 2] - origins[r0, col, 2] + r * (directions[r1, col, 2] - directions[r0, col, 2])) * dv
+            su, sv = float(fit[row, col, 1]), float(fit[row, col, 2])
+            pu0, pu1, pu2 = pu0 + su * d[0], pu1 + su * d[1], pu2 + su * d[2]
+            pv0, pv1, pv2 = pv0 + sv * d[0], pv1 + sv * d[1], pv2 + sv * d[2]
+            nx, ny, nz = pu1 * pv2 - pu2 * pv1, pu2 * pv0 - pu0 * pv2, pu0 * pv1 - pu1 * pv0
+            length = math.sqrt(nx * nx + ny * ny + nz * nz)
+            if not length > 0.0:
+                continue
+            along = (nx * d[0] + ny * d[1] + nz * d[2]) / length
+            flip = -1.0 if along > 0.0 else 1.0
+            nx, ny, nz = flip * nx / length, flip * ny / length, flip * nz / length
+            cosine = abs(along)
+            if cosine < FLATTEST_COSINE:
+                continue
+            error = float(fit[row, col, 3]) * cosine
+            feather = min(1.0, edge[row, col] / FEATHER_CELLS)
+            cells[i, 0], cells[i, 1], cells[i, 2] = r, 0.5 * su, 0.5 * sv
+            cells[i, 3] = feather * feather * cosine / (error * error)
+            cells[i, 4] = rotation[0, 0] * nx + rotation[0, 1] * ny + rotation[0, 2] * nz
+            cells[i, 5] = rotation[1, 0] * nx + rotation[1, 1] * ny + rotation[1, 2] * nz
+            cells[i, 6] = rotation[2, 0] * nx + rotation[2, 1] * ny + rotation[2, 2] * nz
+            cells[i, 7] = cosine
+
+
+@kernel
+def _cells_from_edge(fit, pitch, distance):
+    """Distance of each fitted cell, in cells (chamfer), from the nearest cell without a fit, depth jump, or border of the grid."""
+    height, width = fit.shape[0], fit.shape[1]
+    for row in range(height):
+        for col in range(width):
+            inside = math.isfinite(fit[row, col, 0])
+            if inside:
+                inside = 0 < row < height - 1 and 0 < col < width - 1
+            if inside:
+                step = BEND_TAN * 2.0 * (pitch[0] * fit[row, col, 0] + pitch[1])
+                for k in range(4):
+                    dv, du = (0, 1, 0, -1)[k], (1, 0, -1, 0)[k]
+                    other = fit[row + dv, col + du, 0]
+                    ahead = fit[row, col, 0] + fit[row, col, 1] * du + fit[row, col, 2] * dv
+                    if not abs(other - ahead) <= step + 6.0 * fit[row, col, 3]:
+                        inside = False
+            distance[row, col] = 1e3 if inside else 0.5
+    for sweep in range(2):
+        for i in range(height):
+            row = i if sweep == 0 else height - 1 - i
+            back = -1 if sweep == 0 else 1
+            for j in range(width):
+                col = j if sweep == 0 else width - 1 - j
+                best = distance[row, col]
+                if 0 <= row + back < height:
+                    best = min(best, distance[row + back, col] + 1.0)
+                    if col > 0:
+                        best = min(best, distance[row + back, col - 1] + 1.4)
+                    if col < width - 1:
+                        best = min(best, distance[row + back, col + 1] + 1.4)
+                if 0 <= col + back < width:
+                    best = min(best, distance[row, col + back] + 1.0)
+                distance[row, col] = best
+
+
+@kernel
+def _mark_hit(kind, numbers, height, width, samples, step, hit):
+    """hit (h, w): cells on which a sample of any scan projects, and their neighbours within two cells."""
+    for i in range(0, len(samples), step):
+        u, v, r = project(kind, numbers, samples[i, 0], samples[i, 1], samples[i, 2])
+        if r <= 0.0 or not (-2.0 < u < width + 1.0 and -2.0 < v < height + 1.0):
+            continue
+        col, row = math.floor(u + 0.5), math.floor(v + 0.5)
+        for rr in range(max(row - 2, 0), min(row + 2, height - 1) + 1):
+            for cc in range(max(col - 2, 0), min(col + 2, width - 1) + 1):
+                hit[rr, cc] = True
+
+
+def _cells_of(scan: RangeScan, pose: FloatArray, known: dict[Camera, tuple[FloatArray, FloatArray]]):
+    """Kind, numbers (37,), records (h w, 8), noise (h w,) and lateral pitch at each record of one scan at `pose` (4, 4)."""
+    seen = projection_of(scan, known.get(scan.camera))
+    known.clear()
+    known[scan.camera] = seen.origins, seen.directions
+    back = rigid.inverse(pose)
+    fit, noise = quiet_ranges(seen.ranges, seen.pitch, scan.noise_mm, off=(seen.off_u, seen.off_v))
+    height, width = noise.shape
+    edge = np.empty((height, width), np.float32)
+    _cells_from_edge(fit, seen.pitch, edge)
+    cells = np.empty((height * width, FIELDS), np.float32)
+    rotation = np.ascontiguousarray(pose[:3, :3])
+    in_chunks(lambda i, j: _records(fit, seen.origins, seen.directions, rotation, edge, i, j, cells), height, 32)
+    numbers = np.concatenate([back[:3, :3].ravel(), back[:3, 3], seen.numbers])
+    return seen.kind, numbers, cells, noise.ravel(), seen.pitch[0] * cells[:, RANGE] + seen.pitch[1]
+
+
+def views_of(scans: Sequence[RangeScan]) -> Views:
+    """Prepare the scans. Raises ScanError when none holds a surface, or a camera cannot be projected into."""
+    if not scans:
+        raise ScanError("there are no scans; a surface needs at least one")
+    samples = [scan.need_points(16).points_mm() for scan in scans]
+    shift = 0.5 * (np.min([p.min(axis=0) for p in samples], axis=0) + np.max([p.max(axis=0) for p in samples], axis=0))
+    points = np.concatenate(samples) - shift
+    known: dict[Camera, tuple[FloatArray, FloatArray]] = {}  # scans mostly share one camera
+    poses = [scan.world_from_scan.copy() for scan in scans]
+    for pose in poses:
+        pose[:3, 3] -= shift
+    parts = [_cells_of(scan, pose, known) for scan, pose in zip(scans, poses)]
+    spacings = []
+    for scan, (kind, numbers, cells, _, lateral) in zip(scans, parts):
+        good = cells[:, WEIGHT] > 0
+        spacings.append(lateral[good] / np.sqrt(cells[good, COSINE]))
+        hit = np.zeros(scan.range_mm.shape, bool)
+        _mark_hit(kind, numbers, *hit.shape, points, 2, hit)
+        # a ray that returned nothing, and on which no other scan saw anything, ran through empty space
+        cells[~scan.valid.ravel() & ~hit.ravel(), RANGE] = np.inf
+    spacing = np.concatenate(spacings)
+    if len(spacing) == 0:
+        raise ScanError("the scans' samples lie too far apart to span a surface; check the unit, or use poisson or pivot")
+    starts = np.cumsum([0] + [len(part[2]) for part in parts[:-1]])
+    return Views(
+        kind=np.array([part[0] for part in parts], np.int64),
+        numbers=np.array([part[1] for part in parts]),
+        size=np.array([scan.range_mm.shape for scan in scans], np.int64),
+        start=starts.astype(np.int64),
+        cells=np.concatenate([part[2] for part in parts]),
+        noise_mm=np.concatenate([part[3] for part in parts]),
+        samples_mm=points,
+        spacing_mm=float(np.median(spacing)),
+        shift_mm=shift,
+    )
