@@ -1,10 +1,14 @@
 """Secondary IDs and shadows of scenes whose every chain of reflections can be written down."""
 
+import json
+
 import numpy as np
 import pytest
 
 from rangecheck import kernels, rigid
 from rangecheck.errors import ArrayError
+from rangecheck.export.map_files import write_chain, write_shadows, write_value_map
+from rangecheck.export.pictures import read_map_png16, read_png
 from rangecheck.maps import smooth_normals, trace_chain, trace_maps, trace_shadows, values_seen
 from rangecheck.maps.shadow import LIT, NOTHING, SHADED, TURNED_AWAY
 from rangecheck.optics import PinholeCamera
@@ -188,3 +192,25 @@ def test_values_on_vertices_are_interpolated_and_values_on_faces_are_kept():
     assert np.isnan(seen[~maps.hit]).all()
     faces = values_seen(surface, maps, np.arange(6.0))
     assert (faces[maps.hit] == maps.face[maps.hit]).all()
+
+
+def test_chains_shadows_and_values_become_files(tmp_path):
+    surface = box_corner()
+    maps = trace_maps(surface, PinholeCamera.from_field_of_view(61, 51, 45), rigid.look_at((160, 140, 170), (35, 35, 35)))
+    chain = trace_chain(surface, maps, bounces=2)
+    write_chain(tmp_path, maps, chain)
+    for k in (0, 1):
+        assert (read_png(tmp_path / f"secondary_id_{k + 1}_16bit.png") == chain.part_ids[k]).all()
+    with np.load(tmp_path / "chain.npz") as found:
+        assert (found["faces"] == chain.faces).all()
+    table = json.loads((tmp_path / "reflections.json").read_text())
+    assert sum(row["pixels"] for row in table["pairs"]) == maps.hit.sum()
+    shadows = trace_shadows(surface, maps, np.array([[50, 60, 70, 1], [0, 1, 0, 0]], float))
+    assert len(write_shadows(tmp_path, shadows, ["lamp", "sky"])) == 3
+    height = values_seen(surface, maps, surface.vertices[:, 1] - 30)
+    write_value_map(tmp_path, "height", height, "Height", "mm", signed=True)
+    values, scale = read_map_png16(tmp_path / "height_16bit.png")
+    assert np.nanmax(np.abs(values - height)) <= 0.5001 * scale["step"]
+    # zero is the middle of the colours, as light as they get
+    picture = read_png(tmp_path / "height.png")
+    assert picture.shape[1] > 600

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import io
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
 
+from rangecheck.arrays import FloatArray
 from rangecheck.errors import InputError, RangecheckError
+from rangecheck.export.legend import NOTHING as NOTHING_COLOUR
+from rangecheck.export.legend import Swatches, framed
 from rangecheck.export.mapped import coloured_ids, coloured_map, contour_picture
 from rangecheck.export.pictures import write_id_png16, write_map_png16, write_png
-from rangecheck.files import read_bytes, whole_file
-from rangecheck.maps import Maps
+from rangecheck.files import read_bytes, whole_file, write_json
+from rangecheck.maps import Chain, Maps, Shadows
+from rangecheck.maps.shadow import LIT, NOTHING, SHADED, STATE_NAMES, TURNED_AWAY
 from rangecheck.optics import camera_from_dict
 
 SCHEMA = "rangecheck/maps/1"
@@ -91,3 +96,51 @@ def write_maps(folder: str | Path, maps: Maps, *, stem: str = "", subtitle: str 
         write_png(named("part_id.png"), picture, force=force)
     write_png(named("contours.png"), contour_picture(maps.depth_mm, title="Contours of depth"), force=force)
     return written
+
+
+def write_chain(folder: str | Path, maps: Maps, chain: Chain, *, stem: str = "", force: bool = True) -> list[Path]:
+    """Secondary IDs: exact 16-bit PNG of each reflection, a coloured picture of the first, chain.npz (part_ids, faces), and
+    reflections.json, the table of which surface mirrors which. Returns the paths."""
+    where = Path(folder)
+    paths = [where / f"{stem}{name}" for name in ("chain.npz", "reflections.json", "secondary_id.png")]
+    with whole_file(paths[0], force=force) as part, part.open("wb") as stream:
+        np.savez_compressed(stream, allow_pickle=False, part_ids=chain.part_ids, faces=chain.faces)
+    rows = [{"surface": a, "mirrors": b, "pixels": n} for a, b, n in chain.pairs(maps)]
+    write_json(paths[1], {"schema": "rangecheck/reflections/1", "part_names": list(chain.part_names), "pairs": rows}, force=force)
+    write_png(paths[2], coloured_ids(chain.secondary_id, chain.part_names, "Surface seen in the mirror"), force=force)
+    for bounce, ids in enumerate(chain.part_ids):
+        paths.append(where / f"{stem}secondary_id_{bounce + 1}_16bit.png")
+        write_id_png16(paths[-1], ids, chain.part_names, force=force, reflection=bounce + 1)
+    return paths
+
+
+def write_shadows(
+    folder: str | Path, shadows: Shadows, source_names: Sequence[str], *, stem: str = "", force: bool = True
+) -> list[Path]:
+    """shadows.npz (state, shaded_by) and one coloured picture per source. Returns the paths."""
+    where = Path(folder)
+    paths = [where / f"{stem}shadows.npz"]
+    with whole_file(paths[0], force=force) as part, part.open("wb") as stream:
+        np.savez_compressed(stream, allow_pickle=False, state=shadows.state, shaded_by=shadows.shaded_by)
+    colours = np.array([NOTHING_COLOUR, (255, 236, 179), (120, 128, 150), (52, 58, 78)], np.uint8)
+    order = [LIT, TURNED_AWAY, SHADED]
+    for name, state in zip(source_names, shadows.state, strict=True):
+        seen = max(1, int((state != NOTHING).sum()))
+        shares = tuple(f"{STATE_NAMES[k]}, {100 * (state == k).sum() / seen:.1f} %" for k in order)
+        paths.append(where / f"{stem}shadow_{len(paths)}.png")
+        write_png(paths[-1], framed(colours[state], f"Light of {name}", scale=Swatches(colours[order], shares)), force=force)
+    return paths
+
+
+def write_value_map(
+    folder: str | Path, name: str, values: FloatArray, title: str, unit: str, *, signed: bool = False, force: bool = True
+) -> list[Path]:
+    """A map of a value carried by the surface (see `maps.values_seen`) as `name`_16bit.png and a coloured picture; a signed one
+    is drawn about 0, blue below and red above. Returns the paths."""
+    where = Path(folder)
+    paths = [where / f"{name}_16bit.png", where / f"{name}.png"]
+    write_map_png16(paths[0], values, name, unit, force=force)
+    reach = float(np.nanmax(np.abs(values))) if signed and np.isfinite(values).any() else 1.0
+    ends = {"low": -reach, "high": reach, "colours": "RdBu_r"} if signed else {}
+    write_png(paths[1], coloured_map(values, title, unit, **ends), force=force)  # type: ignore[arg-type]
+    return paths

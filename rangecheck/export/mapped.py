@@ -24,6 +24,8 @@ RELIEF_LIGHT = (-0.5, -0.6, 0.62)
 #: a cell between four pixels whose depths differ by more than this many pixel widths is an edge of the scene, not a slope
 JUMP_SLOPE = 8.0
 INDEX_EVERY = 5
+#: shorter pieces of iso-lines, in pixels of the map, are crumbs at ragged borders
+SHORTEST_LINE_PX = 3.0
 
 
 def _zoom(shape: tuple[int, ...], picture_px: int) -> int:
@@ -167,7 +169,8 @@ def contour_picture(
     for level, lines in iso_lines(depth, step, JUMP_SLOPE * pixel).items():
         heavy = round(level / step) % INDEX_EVERY == 0
         # 4 binary digits of sub-pixel position
-        drawn = [np.rint(((line + 0.5) * factor - 0.5) * 16).astype(np.int32) for line in lines]
+        long_enough = [line for line in lines if np.hypot(*np.diff(line, axis=0).T).sum() >= SHORTEST_LINE_PX]
+        drawn = [np.rint(((line + 0.5) * factor - 0.5) * 16).astype(np.int32) for line in long_enough]
         cv2.polylines(picture, drawn, False, (16, 18, 22), thin + 1 if heavy else thin, cv2.LINE_AA, 4)
     subtitle = subtitle or f"a line every {step:g} mm, every {INDEX_EVERY * step:g} mm heavier"
     heavy_step = INDEX_EVERY * step
