@@ -11,6 +11,8 @@ from rangecheck.rigid import about_axis, move_points
 from rangecheck.scan import RangeScan
 from rangecheck.scan.point_cloud import PointCloud
 from rangecheck.scan.readers import read_measured, read_scans, write_pcd, write_ptx
+from rangecheck.scan.readers.depth_exr import read_exr
+from rangecheck.scan.readers.depth_tiff import read_tiff
 from rangecheck.scan.readers.e57 import _table, first_wrong_page, unpack_bits
 from rangecheck.scan.readers.lzf import pack, unpack
 
@@ -73,6 +75,41 @@ def test_a_16_bit_tiff_holds_counts(tmp_path):
     counts = np.random.default_rng(0).integers(0, 2**16, (18, 24)).astype(np.uint16)
     (scan,) = read_scans(picture(tmp_path, counts, ".tif"))
     assert np.allclose(scan.depth_mm[counts > 0], counts[counts > 0], rtol=3e-7) and not scan.valid[counts == 0].any()
+
+
+@pytest.mark.parametrize("compression", ["raw", "tiff_lzw", "tiff_deflate"])
+@pytest.mark.parametrize("predictor", [1, 2, 3])
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float32])
+def test_tiff_strips_are_unpacked_as_they_were_packed(tmp_path, compression, predictor, kind):
+    if (compression == "raw" and predictor > 1) or (predictor == 3 and kind is not np.float32):
+        return  # TIFF has no such file
+    from PIL import Image
+
+    values = (np.add.outer(np.arange(70) * 3, np.arange(90) // 2) + np.random.default_rng(0).integers(0, 3, (70, 90))).astype(
+        kind
+    )
+    Image.fromarray(values).save(tmp_path / "a.tif", compression=compression, tiffinfo={317: predictor})
+    assert (read_tiff(tmp_path / "a.tif") == values).all()
+
+
+@pytest.mark.parametrize("how", ["NO", "ZIPS", "ZIP"])
+@pytest.mark.parametrize("size", [(1, 1), (33, 7), (16, 20)])
+def test_exr_lines_are_unpacked_as_they_were_packed(tmp_path, how, size):
+    OpenEXR = pytest.importorskip("OpenEXR")
+    random = np.random.default_rng(0)
+    channels = {"A": random.random(size).astype(np.float16), "Z": random.random(size).astype(np.float32)}
+    channels["b"] = np.arange(size[0] * size[1], dtype=np.uint32).reshape(size)
+    header = {"compression": getattr(OpenEXR, f"{how}_COMPRESSION"), "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, channels).write(str(tmp_path / "a.exr"))
+    assert (read_exr(tmp_path / "a.exr") == channels["Z"]).all()
+
+
+def test_an_exr_compressed_otherwise_says_how_to_save_it(tmp_path):
+    OpenEXR = pytest.importorskip("OpenEXR")
+    header = {"compression": OpenEXR.PIZ_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, {"Z": np.ones((4, 5), np.float32)}).write(str(tmp_path / "a.exr"))
+    with pytest.raises(InputError, match="compressed by PIZ"):
+        read_exr(tmp_path / "a.exr")
 
 
 @pytest.mark.parametrize("ending", [".pfm", ".exr", ".tif"])

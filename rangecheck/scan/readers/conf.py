@@ -11,6 +11,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from rangecheck import rigid
 from rangecheck.arrays import FloatArray, mm_per
 from rangecheck.errors import ArrayError, InputError, UnitMissing
@@ -28,7 +30,8 @@ def read_conf(path: Path, unit: str | None = None) -> list[RangeScan]:
     placed = _placed(path, mm_per(unit))
 
     def read(first: int, last: int) -> list[RangeScan]:
-        scans = [read_range_grid(file, unit)[0] for file, _ in placed[first:last]]
+        with np.errstate(all="ignore"):  # threads do not inherit it
+            scans = [read_range_grid(file, unit)[0] for file, _ in placed[first:last]]
         return [scan.moved(pose @ scan.world_from_scan) for scan, (_, pose) in zip(scans, placed[first:last])]
 
     return [scan for some in in_chunks(read, len(placed), 1) for scan in some]

@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from rangecheck.arrays import mm_per
 from rangecheck.errors import InputError, UnitMissing
 from rangecheck.files import read_bytes
@@ -101,7 +103,9 @@ def read_measured(path: str | Path, unit: str | None = None) -> list[Measured]:
         mm_per(unit)
     if path.is_dir():
         return _read_folder(path, unit)
-    return list(_format_of(path).read(path, unit))
+    # files hold any bits: NaN that signal, numbers past float32; what is not finite counts as not measured
+    with np.errstate(all="ignore"):
+        return list(_format_of(path).read(path, unit))
 
 
 def _format_of(path: Path) -> Format:

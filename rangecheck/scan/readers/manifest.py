@@ -192,7 +192,7 @@ def _scan(path: Path, where: str, entry: Any, unit: str) -> RangeScan:
 
 
 def _number(path: Path, label: str, key: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not (np.isfinite(value) and value > 0):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1e30:
         raise InputError(path, f"{label}has {key} {value!r}; it must be a positive number", key=key)
     return float(value)
 

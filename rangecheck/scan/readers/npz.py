@@ -69,7 +69,7 @@ def read_npz(path: Path, unit: str | None = None) -> list[RangeScan]:
             members = {
                 info.filename.removesuffix(".npy"): _member(path, archive, info, len(content)) for info in archive.infolist()
             }
-    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, OSError, UnicodeDecodeError) as error:
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, OSError, ValueError) as error:
         raise InputError(path, f"is a damaged NumPy archive ({error}); copy or write it again") from None
     missing = [name for name in ("schema", "description", "range_mm", "world_from_scan") if name not in members]
     if missing:

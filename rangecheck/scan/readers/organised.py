@@ -37,7 +37,7 @@ def scan_from_points(
     None when no point is left. Rows are turned over when they run upwards, so that the first row is the top one."""
     with np.errstate(over="ignore", invalid="ignore"):
         ranges = np.sqrt((points_mm * points_mm).sum(axis=-1))
-    valid = np.isfinite(ranges) & (ranges > 0) & np.isfinite(ranges.astype(np.float32)) & (ranges.astype(np.float32) > 0)
+    valid = (ranges > 1e-30) & (ranges < 1e30)
     if not valid.any():
         return None
     if _mirrored(points_mm, valid):
