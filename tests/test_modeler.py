@@ -9,7 +9,7 @@ from rangecheck import rigid
 from rangecheck.analytic import shapes
 from rangecheck.errors import InputError, RangecheckError, SceneError
 from rangecheck.files import presets_folder
-from rangecheck.maps import back_projection_error, trace_chain, trace_maps
+from rangecheck.maps import back_projection_error, trace_chain, trace_maps, trace_shadows
 from rangecheck.modeler import model_from_dict, read_model
 from rangecheck.optics import PinholeCamera
 
@@ -206,6 +206,23 @@ def test_every_pixel_of_a_ball_over_a_plane_mirrors_what_the_closed_form_says():
     assert (maps.part_id[alike] == expected[0][alike]).all()
     assert (chain.secondary_id[alike] == expected[1][alike]).all()
     assert {(1, 0), (1, 2), (2, 0), (2, 1)} <= set(map(tuple, expected[:, alike].T))
+
+
+def test_the_terminator_of_a_facetted_ball_is_the_great_circle():
+    model = scene({"shape": "sphere", "radius_mm": 30}, tolerance_mm=0.2)
+    camera = PinholeCamera.from_field_of_view(161, 161, 20)
+    maps = trace_maps(model.surface, camera, rigid.look_at((0, 0, 260), (0, 0, 0)))
+    sun = np.array([[1.0, 0.3, 0.2, 0.0]])
+    points = maps.points_mm()[maps.hit]
+    height = points @ sun[0, :3] / np.linalg.norm(sun) / 30
+
+    def wrong(**how):
+        lit = trace_shadows(model.surface, maps, sun, **how).lit[0][maps.hit]
+        return (lit != (height > 0)).mean()
+
+    # a lifted point behind the terminator by the angle acos(r / (r + lift)) still sees the sun only if its normal does
+    assert wrong(normals=model.normals_at, lift_mm=2 * model.tolerance_mm) < 1e-4
+    assert wrong() > 0.01
 
 
 def test_the_tolerance_defaults_to_a_tenth_of_a_pixel_of_the_scenes_camera():

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from rangecheck.arrays import BoolArray, FloatArray, IntArray, require, unit_vectors
 from rangecheck.errors import ArrayError
 from rangecheck.kernels import in_chunks
-from rangecheck.maps.secondary import SKIN
+from rangecheck.maps.secondary import SKIN, NormalsAt
 from rangecheck.maps.trace import PIXELS_PER_CHUNK, Caster, Maps
 from rangecheck.raycast import EmbreeCaster
 from rangecheck.surface import Surface
@@ -44,8 +44,19 @@ class Shadows:
         return (self.lit[:32] * bits[:, None, None]).sum(axis=0, dtype=np.uint32)
 
 
-def trace_shadows(surface: Surface, maps: Maps, sources: FloatArray, caster: Caster | None = None) -> Shadows:
-    """Cast a shadow ray from every seen point to every source's centre. The side that the camera sees is the side judged."""
+def trace_shadows(
+    surface: Surface,
+    maps: Maps,
+    sources: FloatArray,
+    caster: Caster | None = None,
+    *,
+    normals: NormalsAt | None = None,
+    lift_mm: float = 0.0,
+) -> Shadows:
+    """Cast a shadow ray from every seen point to every source's centre. The side that the camera sees is the side judged.
+
+    Where facets stand for a curved surface, `normals` (see `trace_chain`) decide what turns away, and rays start `lift_mm` off the
+    facets - twice the tessellation error clears the chords - so that the terminator is the true surface's and not the facets'."""
     lamps = require("sources", sources, (None, 4), finite=True)
     if not np.isin(lamps[:, 3], (0.0, 1.0)).all() or (np.linalg.norm(lamps[lamps[:, 3] == 0, :3], axis=1) == 0).any():
         raise ArrayError("sources must be points (x, y, z, 1) or directions (x, y, z, 0) that are not zero", name="sources")
@@ -53,14 +64,15 @@ def trace_shadows(surface: Surface, maps: Maps, sources: FloatArray, caster: Cas
     pixels = np.flatnonzero(maps.hit)
     points, seen_face = maps.points_mm().reshape(-1, 3)[pixels], maps.face.ravel()[pixels]
     back = maps.incidence_rad.ravel()[pixels] > np.pi / 2
-    side = np.nan_to_num(surface.face_normals[seen_face]) * np.where(back, -1.0, 1.0)[:, None]
+    outward = surface.face_normals[seen_face] if normals is None else normals(points, seen_face)
+    side = np.nan_to_num(outward) * np.where(back, -1.0, 1.0)[:, None]
     state = np.zeros((len(lamps), maps.face.size), np.uint8)
     shaded_by = np.zeros((len(lamps), maps.face.size), np.int32)
-    skin_mm = SKIN * surface.extent_mm
+    start_mm = SKIN * surface.extent_mm + lift_mm
 
     def chunk(start: int, stop: int) -> None:
         here = slice(start, stop)
-        origins = points[here] + skin_mm * side[here]
+        origins = points[here] + start_mm * side[here]
         for k, lamp in enumerate(lamps):
             to_lamp = np.broadcast_to(lamp[:3], origins.shape) - lamp[3] * origins
             reach = np.linalg.norm(to_lamp, axis=1) if lamp[3] else np.full(len(origins), np.inf)
