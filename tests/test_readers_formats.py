@@ -100,7 +100,7 @@ def test_exr_lines_are_unpacked_as_they_were_packed(tmp_path, how, size):
     channels = {"A": random.random(size).astype(np.float16), "Z": random.random(size).astype(np.float32)}
     channels["b"] = np.arange(size[0] * size[1], dtype=np.uint32).reshape(size)
     header = {"compression": getattr(OpenEXR, f"{how}_COMPRESSION"), "type": OpenEXR.scanlineimage}
-    OpenEXR.File(header, channels).write(str(tmp_path / "a.exr"))
+    OpenEXR.File(header, dict(channels)).write(str(tmp_path / "a.exr"))
     assert (read_exr(tmp_path / "a.exr") == channels["Z"]).all()
 
 
