@@ -9,7 +9,7 @@ SYSTEM := libusb-1.0-0 libegl1 libgl1 libx11-6 libidn2-0 libgomp1
 .PHONY: demo test lint sample clean
 
 demo: $(VENV)/.ready-demo
-	$(BIN)/rangecheck run sample_data/bust --out $(OUT) --force
+	$(BIN)/rangecheck run sample_data --out $(OUT) --force
 
 test: $(VENV)/.ready-test
 	$(BIN)/pytest $(PYTEST_ARGS)

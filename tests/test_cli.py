@@ -44,7 +44,9 @@ def test_an_unknown_command_or_option_names_the_nearest(capsys):
     assert "--frmes" in complaint(capsys, "turntable", "x.ply", "-o", "y.mp4", "--frmes", "3")
 
 
-@pytest.mark.parametrize("command", [["check"], ["mesh", "-o", "out.ply"], ["solid", "-o", "out.stl"], ["render", "-o", "out.png"]])
+@pytest.mark.parametrize(
+    "command", [["check"], ["mesh", "-o", "out.ply"], ["solid", "-o", "out.stl"], ["render", "-o", "out.png"]]
+)
 def test_a_missing_file_is_one_line_and_status_2(command, capsys, tmp_path):
     assert "does not exist" in complaint(capsys, *command, tmp_path / "no such file.ply", "--unit", "mm")
     assert list(tmp_path.iterdir()) == []
@@ -52,7 +54,9 @@ def test_a_missing_file_is_one_line_and_status_2(command, capsys, tmp_path):
 
 def test_a_truncated_ply_is_refused(capsys, tmp_path, sample_data):
     broken = tmp_path / "half a mesh.ply"
-    broken.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 0\n1 0")
+    broken.write_bytes(
+        b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 0\n1 0"
+    )
     assert broken.name in complaint(capsys, "check", broken, "--unit", "mm")
 
 
@@ -63,7 +67,7 @@ def test_a_png_that_is_no_png_is_refused(capsys, tmp_path):
 
 
 def test_a_camera_with_nan_is_refused(capsys, tmp_path, sample_data):
-    manifest = (sample_data / "relief" / "scans.json").read_text().replace('"fx": ', '"fx": NaN, "was": ')
+    manifest = (sample_data / "frontal" / "scans.json").read_text().replace('"fx": ', '"fx": NaN, "was": ')
     (tmp_path / "scans.json").write_text(manifest)
     assert "NaN" in complaint(capsys, "run", tmp_path / "scans.json", "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
@@ -82,7 +86,7 @@ def test_a_scan_in_which_nothing_returned_is_refused(capsys, tmp_path):
 
 def test_a_folder_that_cannot_be_written_is_refused_before_any_work(capsys, tmp_path, sample_data):
     (tmp_path / "file").write_text("in the way")
-    message = complaint(capsys, "run", sample_data / "bust", "--out", tmp_path / "file" / "out")
+    message = complaint(capsys, "run", sample_data, "--out", tmp_path / "file" / "out")
     assert "file" in message
 
 

@@ -1,6 +1,37 @@
-"""The story: the only room that knows every stage and the configuration; each command is one function here."""
+"""The story: the only room that knows every stage and the configuration; each command is one function here.
 
-from rangecheck.pipeline.doctor import doctor
+The functions are found in their own files and loaded when first asked for, so that a command loads no other command's rooms.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
 from rangecheck.pipeline.outcome import Outcome
 
-__all__ = ["Outcome", "doctor"]
+_WHERE = {
+    "check": "inspect",
+    "doctor": "health",
+    "explain": "inspect",
+    "maps": "pictures",
+    "materials": "inspect",
+    "mesh": "shape",
+    "render": "pictures",
+    "run": "job",
+    "sample": "shape",
+    "simulate": "shape",
+    "solid": "shape",
+    "turntable": "pictures",
+}
+
+__all__ = ["Outcome", *_WHERE]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _WHERE:
+        raise AttributeError(f"rangecheck.pipeline has no command {name!r}")
+    module = importlib.import_module(f"rangecheck.pipeline.{_WHERE[name]}")
+    found = getattr(module, name)
+    globals()[name] = found
+    return found

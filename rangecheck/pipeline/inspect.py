@@ -1,0 +1,91 @@
+"""check, explain, materials: commands that only look."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rangecheck.config import Settings
+from rangecheck.errors import InputError
+from rangecheck.files import sha256
+from rangecheck.pipeline.outcome import Outcome, document
+from rangecheck.pipeline.shape import findings_lines
+from rangecheck.pipeline.subject import holds_scans, read_all_scans
+from rangecheck.progress import Reporter
+from rangecheck.scan import RangeScan
+from rangecheck.solid import check_solid
+from rangecheck.solid.findings import catalogue
+from rangecheck.solid.findings import explain as explain_code
+
+
+def check(files: Sequence[str], *, settings: Settings, unit: str | None, reporter: Reporter) -> Outcome:
+    """Each file judged for what it is: scans by what they hold, meshes as the boundary of a solid."""
+    from rangecheck.surface.mesh_files import open_mesh
+
+    results: list[dict[str, Any]] = []
+    lines: list[str] = []
+    for file in files:
+        path = Path(file)
+        if not path.exists():
+            raise InputError(path, "does not exist; check the name")
+        if holds_scans(path):
+            scans = read_all_scans([path], unit, reporter)
+            about = [scan_facts(scan) for scan in scans]
+            results.append({"file": file, "kind": "scans", "fit": True, "scans": about})
+            lines.append(f"{file}: {len(scans)} readable range scans")
+            lines += [
+                f"  {a['name']}: {a['width']}x{a['height']}, {a['valid']:,} distances ({a['valid_share']:.0%}), "
+                f"{a['nearest_mm']:.1f} to {a['farthest_mm']:.1f} mm, spacing {a['spacing_mm']:.2f} mm"
+                for a in about
+            ]
+            continue
+        with reporter.stage("reading mesh"):
+            opened = open_mesh(path, unit)
+        with reporter.stage("checking"):
+            verdict = check_solid(opened.surface, severities=settings.checking.severities)
+        results.append({"file": file, "kind": "mesh", "sha256": sha256(path), "notes": opened.notes, **verdict.to_dict()})
+        lines.append(f"{file}:")
+        lines += [f"  {note}" for note in opened.notes]
+        lines += [f"  {line}" for line in findings_lines(verdict)]
+    fit = all(result["fit"] for result in results)
+    return Outcome(document("check", fit=fit, files=results, seconds=reporter.seconds), lines, fit)
+
+
+def scan_facts(scan: RangeScan) -> dict[str, Any]:
+    """What a scan holds, in numbers."""
+    ranges = scan.range_mm[scan.valid]
+    points = scan.grid_points_mm
+    with np.errstate(invalid="ignore"):
+        steps = [np.linalg.norm(np.diff(points, axis=axis), axis=2).ravel() for axis in (0, 1)]
+    between = np.concatenate(steps)
+    return {
+        "name": scan.name,
+        "width": scan.camera.width,
+        "height": scan.camera.height,
+        "camera": scan.camera.model,
+        "unit": scan.unit,
+        "valid": int(scan.valid.sum()),
+        "valid_share": float(scan.valid.mean()),
+        "nearest_mm": float(ranges.min()),
+        "farthest_mm": float(ranges.max()),
+        "spacing_mm": float(np.nanmedian(between)) if np.isfinite(between).any() else None,
+        "noise_mm": scan.noise_mm,
+        "brightness": scan.brightness is not None,
+    }
+
+
+def explain(code: str | None) -> Outcome:
+    """One finding's meaning, or the list of all."""
+    if code is None:
+        entries = list(catalogue().values())
+        return Outcome(
+            document("explain", codes=[vars(e) for e in entries]), [f"{e.code:<24} {e.severity:<8} {e.title}" for e in entries]
+        )
+    entry = explain_code(code)
+    return Outcome(
+        document("explain", **vars(entry)),
+        [f"{entry.code} ({entry.severity}): {entry.title}", f"why:  {entry.why}", f"mend: {entry.mend}"],
+    )

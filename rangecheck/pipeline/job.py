@@ -1,0 +1,201 @@
+"""run: the whole job in the order in which a person would want it - mesh, check, look, and only then export."""
+
+from __future__ import annotations
+
+import resource
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rangecheck import report
+from rangecheck.config import Settings
+from rangecheck.export.map_files import write_maps
+from rangecheck.export.mapped import contour_picture
+from rangecheck.export.meshes import write_mesh
+from rangecheck.export.pictures import png_bytes
+from rangecheck.export.stl import write_stl
+from rangecheck.export.video import find_encoder
+from rangecheck.files import read_bytes, write_bytes, write_json
+from rangecheck.pipeline.folder import check_free, job_folder, key_of
+from rangecheck.pipeline.health import versions
+from rangecheck.pipeline.inspect import scan_facts
+from rangecheck.pipeline.outcome import Outcome, document
+from rangecheck.pipeline.pictures import Rendered, map_at, orbit_of, render_turntable
+from rangecheck.pipeline.shape import findings_lines, solid_of
+from rangecheck.pipeline.subject import eye_of, hashes, read_all_scans, surface_of
+from rangecheck.progress import Reporter
+from rangecheck.scan import RangeScan
+from rangecheck.solid import Finding, Verdict, finding, verdict
+from rangecheck.surface import INVENTED, ORIGIN_NAMES, Surface
+
+FINISHED = "run.json"
+
+
+def run(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None, force: bool, reporter: Reporter) -> Outcome:
+    """Scans in; in `out` the bust's STL (of a solid only), turntables, maps, report.html and run.json."""
+    check_free(out, FINISHED, force=force)
+    find_encoder(".mp4")
+    read = read_all_scans(scans, unit, reporter)
+    inputs = hashes(scans)
+    key = key_of(inputs=inputs, unit=unit, settings=settings.model_dump(mode="json"), versions=versions())
+    with job_folder(out, key, FINISHED, force=force) as folder:
+        write_json(folder / "settings.json", document("settings", **settings.model_dump(mode="json")))
+        surface, method, reason = surface_of(read, settings, reporter)
+        made, judged = solid_of(surface, settings, reporter, eye_of(read))
+        shown = surface if made is None else made.surface
+        judged = _with_scan_findings(judged, shown, settings)
+        write_mesh(shown, folder / "surface.ply")
+
+        orbit = orbit_of(shown, settings)
+        turntables = [
+            render_turntable(
+                shown, name, orbit, folder / f"{name}.mp4", folder / "frames" / name, settings, reporter, force=force
+            )
+            for name in settings.light.materials
+        ]
+        with reporter.stage("contours"):
+            contours = {scan.name: png_bytes(_contours(scan, settings)) for scan in read}
+            for name, picture in contours.items():
+                write_bytes(folder / "contours" / f"{name}.png", picture)
+        distance_maps = _distance_maps(shown, folder, settings, reporter)
+
+        stl: dict[str, Any] | None = None
+        (folder / "bust.stl").unlink(missing_ok=True)
+        if made is not None and judged.fit:
+            with reporter.stage("exporting STL"):
+                written = write_stl(made, folder / "bust.stl")
+            stl = {
+                "file": "bust.stl",
+                "faces": written.faces,
+                "moved_by_rounding_mm": written.moved_mm,
+                "verdict": written.verdict.to_dict(),
+            }
+        else:
+            reporter.note("no STL: the verdict holds it back")
+
+        shares = {name: shown.share_of_area(origin) for origin, name in enumerate(ORIGIN_NAMES)}
+        content = document(
+            "run", fit=judged.fit, verdict=judged.to_dict(), stl=stl, method=method, reason=reason, area_shares=shares,
+            scans=[scan_facts(scan) for scan in read], faces=len(shown.faces), decisions=reporter.notes,
+            turntables=[{"material": t.material, "film": t.film.name, "frames": len(t.frames), "plan": t.plan} for t in turntables],
+            inputs=inputs, settings=settings.model_dump(mode="json"), versions=versions(), seconds=reporter.seconds,
+            peak_memory_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        )  # fmt: skip
+        with reporter.stage("report"):
+            page = _page(content, judged, read, contours, distance_maps, turntables)
+            report.write_report(page, folder / "report.html")
+        content["seconds"] = dict(reporter.seconds)
+        write_json(folder / FINISHED, content)
+    total = sum(reporter.seconds.values())
+    lines = [
+        f"{out}: {'fit' if judged.fit else 'not fit'}; {total:.1f} s",
+        *findings_lines(judged),
+        f"bust.stl: {stl['faces']:,} faces, read back and checked" if stl else "no STL: the findings above hold it back",
+        f"look at {Path(out) / 'report.html'}",
+    ]
+    return Outcome(content, lines, judged.fit)
+
+
+def _with_scan_findings(judged: Verdict, shown: Surface, settings: Settings) -> Verdict:
+    """The verdict, and whether too much of the surface was never measured."""
+    areas = shown.face_areas
+    standing = np.array([name not in ("base", "back", "skirt") for name in shown.part_names])[shown.part_of_face]
+    invented = (shown.origin_of_face == INVENTED) & standing
+    share = float(areas[invented].sum() / max(areas[standing].sum(), 1e-300))
+    facts = dict(judged.facts) | {"invented_share": share}
+    found: list[Finding] = list(judged.findings)
+    limit = settings.checking.max_invented_percent / 100
+    if share > limit:
+        faces = np.flatnonzero(invented)
+        found.append(
+            finding(
+                "too-much-invented", len(faces), f"{share:.1%} of the surface was never measured; {limit:.0%} is allowed",
+                shown.triangles[faces].mean(axis=1), faces, settings.checking.severities,
+            )
+        )  # fmt: skip
+    return verdict(found, facts)
+
+
+def _contours(scan: RangeScan, settings: Settings) -> Any:
+    return contour_picture(
+        scan.depth_mm.astype(np.float64), settings.maps.contour_step_mm, title=f"Depth contours of {scan.name}"
+    )
+
+
+def _distance_maps(shown: Surface, folder: Path, settings: Settings, reporter: Reporter) -> list[tuple[str, bytes]]:
+    found = []
+    with reporter.stage("distance maps", len(settings.maps.azimuths_deg)):
+        for index, azimuth in enumerate(settings.maps.azimuths_deg):
+            measured, where = map_at(shown, settings, azimuth)
+            where_to = folder / "maps" / f"azimuth_{azimuth:g}"
+            write_maps(where_to, measured, subtitle=where)
+            found.append((where, read_bytes(where_to / "distance.png")))
+            reporter.advance(index + 1)
+    return found
+
+
+def _page(
+    content: dict[str, Any],
+    judged: Verdict,
+    read: list[RangeScan],
+    contours: dict[str, bytes],
+    distance_maps: list[tuple[str, bytes]],
+    turntables: list[Rendered],
+) -> report.ReportContent:
+    """What the report shows, in the order in which a person decides."""
+    import json
+
+    shares = content["area_shares"]
+    reasons = [
+        judged.sentence(),
+        f"{shares['measured']:.0%} of the surface is measured, {shares['interpolated']:.0%} interpolated, {shares['invented']:.0%} invented",
+        f"meshed by {content['method']}: {content['reason']}",
+    ]
+    pictures = [
+        report.Figure(name, "iso-lines of depth over the scan's own relief", picture) for name, picture in contours.items()
+    ]
+    pictures += [
+        report.Figure(scan.name, "brightness, as the scanner's camera saw it", png_bytes(_brightness(scan)))
+        for scan in read
+        if scan.brightness is not None
+    ]
+    scan_section = report.Section(
+        "Scans",
+        "What came in: cells without a return stay without one, they are never points.",
+        [(fact["name"], f"{fact['valid']:,} distances, {fact['valid_share']:.0%} of the grid") for fact in content["scans"]],
+        pictures,
+    )
+    map_section = report.Section(
+        "Distance maps",
+        "Length from a focal point to the surface, from places where no scan was taken.",
+        figures=[report.Figure("Distance", where, picture) for where, picture in distance_maps],
+    )
+    findings = [
+        report.Finding(
+            f.code, f.severity, f.count, f.message,
+            "; ".join("(" + ", ".join(f"{x:.1f}" for x in p) + ")" for p in f.places_mm[:2]) + (" mm" if len(f.places_mm) else ""),
+            f.why, f.mend,
+        )
+        for f in judged.findings
+    ]  # fmt: skip
+    provenance = [(name, text) for name, text in content["versions"].items()]
+    provenance += [(f"input {name}", digest[:16]) for name, digest in content["inputs"].items()]
+    provenance += [(f"time for {stage}", f"{seconds:.1f} s") for stage, seconds in content["seconds"].items()]
+    return report.ReportContent(
+        title="rangecheck report",
+        fit=judged.fit,
+        verdict="bust.stl can be built." if content["stl"] else "No STL was written.",
+        reasons=reasons,
+        sections=[scan_section, map_section],
+        turntables=[report.Turntable(t.material, t.frames) for t in turntables],
+        findings=findings,
+        settings=json.dumps(content["settings"], indent=1),
+        provenance=provenance,
+    )
+
+
+def _brightness(scan: RangeScan) -> Any:
+    assert scan.brightness is not None
+    return np.rint(255 * np.nan_to_num(np.clip(scan.brightness, 0, 1))).astype(np.uint8)

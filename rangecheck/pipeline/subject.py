@@ -1,0 +1,95 @@
+"""What a command is given: scans, a mesh, or both worlds in one - always ending in a surface."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rangecheck.arrays import FloatArray
+from rangecheck.config import Settings
+from rangecheck.errors import InputError
+from rangecheck.files import read_bytes, sha256
+from rangecheck.optics import PinholeCamera
+from rangecheck.progress import Reporter
+from rangecheck.scan import RangeScan
+from rangecheck.surface import Surface
+
+MESH_SUFFIXES = (".stl", ".obj", ".off", ".glb", ".3mf", ".ply")
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A surface, and the scans it was made of where it was."""
+
+    name: str
+    surface: Surface
+    scans: list[RangeScan] = field(default_factory=list)
+    method: str = "read"
+
+
+def holds_scans(path: Path) -> bool:
+    """Whether `path` is read as range scans rather than as a mesh: by its kind, and for PLY by its header."""
+    if path.is_dir() or path.suffix.lower() not in MESH_SUFFIXES:
+        return True
+    return path.suffix.lower() == ".ply" and b"range_grid" in read_bytes(path, 4096)
+
+
+def read_all_scans(paths: Sequence[str | Path], unit: str | None, reporter: Reporter) -> list[RangeScan]:
+    """Scans of all paths in order; each holds enough points to go on."""
+    from rangecheck.scan.readers import read_scans
+
+    with reporter.stage("reading scans"):
+        scans = [scan for path in paths for scan in read_scans(path, unit)]
+    for scan in scans:
+        scan.need_points()
+    points = sum(int(scan.valid.sum()) for scan in scans)
+    reporter.note(f"{len(scans)} scan{'s' if len(scans) != 1 else ''}, {points:,} distances")
+    return scans
+
+
+def surface_of(scans: list[RangeScan], settings: Settings, reporter: Reporter) -> tuple[Surface, str, str]:
+    """One surface of all scans, the method that made it, and why that one."""
+    from rangecheck.surface.meshing import choose_method, mesh_scans
+
+    method, reason = settings.meshing.method, "asked for"
+    if method == "auto":
+        method, reason = choose_method(scans)
+    with reporter.stage("meshing"):
+        surface = mesh_scans(scans, method, voxel_mm=settings.meshing.voxel_mm, max_angle_deg=settings.meshing.max_angle_deg)
+    reporter.note(f"meshed by {method}: {reason}; {len(surface.faces):,} faces")
+    return surface, method, reason
+
+
+def read_subject(path: str | Path, settings: Settings, unit: str | None, reporter: Reporter) -> Subject:
+    """The surface behind `path`: a mesh file, or scans that are meshed first."""
+    from rangecheck.surface.mesh_files import read_mesh
+
+    where = Path(path)
+    if not where.exists():
+        raise InputError(where, "does not exist; check the name")
+    if holds_scans(where):
+        scans = read_all_scans([where], unit, reporter)
+        surface, method, _ = surface_of(scans, settings, reporter)
+        return Subject(where.stem, surface, scans, method)
+    with reporter.stage("reading mesh"):
+        return Subject(where.stem, read_mesh(where, unit))
+
+
+def hashes(paths: Sequence[str | Path]) -> dict[str, str]:
+    """sha256 by name of every input file; folders file by file."""
+    found: dict[str, str] = {}
+    for path in map(Path, paths):
+        files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+        if path.suffix in (".conf", ".json"):
+            files = sorted(p for p in path.parent.iterdir() if p.is_file())
+        for file in files:
+            found[str(file.relative_to(path.parent)) if file != path else path.name] = sha256(file)
+    return found
+
+
+def eye_of(scans: Sequence[RangeScan]) -> FloatArray | None:
+    """(3,) where a single scan was taken from, world frame; None for several scans, and where a scanner's rays are parallel."""
+    if len(scans) == 1 and isinstance(scans[0].camera, PinholeCamera):
+        return scans[0].world_from_scan[:3, 3]
+    return None
