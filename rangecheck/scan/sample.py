@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,6 @@ from rangecheck.files import write_bytes
 from rangecheck.optics import PinholeCamera
 from rangecheck.raycast.implicit import ImplicitCaster
 from rangecheck.rigid import look_at
-from rangecheck.scan.range_scan import RangeScan
 from rangecheck.scan.readers.manifest import write_scans
 from rangecheck.scan.simulate import RangeFinder, SimulatedScan, ring_of_poses, simulate_scan
 
@@ -56,8 +56,7 @@ def sample_frontal() -> SimulatedScan:
     scan = made.scan
     assert scan.brightness is not None
     coarse = (np.rint(scan.brightness * 255.0) / 255.0).astype(np.float32)
-    scan = RangeScan(scan.range_mm, scan.camera, scan.world_from_scan, coarse, scan.name, scan.unit, scan.noise_mm)
-    return SimulatedScan(scan, made.true_range_mm, made.true_normal, made.noise_mm, made.reason)
+    return replace(made, scan=replace(scan, brightness=coarse))
 
 
 def make_sample_data(folder: str | Path) -> list[Path]:

@@ -1,97 +1,42 @@
 """A range finder that measures a known surface: what it would have returned, and the truth beside it.
 
-Active triangulation: a camera and a light source at a baseline from it. A cell returns a distance only where the camera sees the
-surface, the source lights it, and the surface is not too oblique to either. The error of range is
+Three kinds. `stripe`: a camera and a swept sheet of light at a baseline; `gray-code`: the same with a projector, whose columns cut range
+into steps; `time-of-flight`: the phase of modulated light, mixed over each pixel. A cell returns a distance only where the camera sees
+the surface, the source lights it, it is not too oblique to either, and enough light comes back.
 
-    sigma(r, theta) = noise_mm (r / working_distance_mm)^2 / cos theta,
-
-the square because range goes as the inverse of disparity (dr = r^2 d(disparity) / (f b); Besl, *Active, optical range imaging
-sensors*, 1988), the cosine because a spot on an oblique surface is stretched in the picture. Depth is then rounded to `step_mm`.
-
-World frame and millimetres; the scan's camera frame is x right, y down, z forward; angles are from the surface normal.
+World frame and millimetres; the scan's camera frame is x right, y down, z forward; angles are from the surface normal. Light is
+relative to that of a white matt surface facing the source at the working distance.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
-from typing import Protocol
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from rangecheck import rigid
-from rangecheck.arrays import BoolArray, FloatArray, IntArray, require, unit_vectors
+from rangecheck.arrays import FloatArray, IntArray, require
 from rangecheck.errors import SettingError
-from rangecheck.kernels import in_chunks
 from rangecheck.optics import Camera
-from rangecheck.raycast.embree import Hits
 from rangecheck.scan.range_scan import RangeScan
+from rangecheck.scan.simulate_finder import KINDS, KINECT, NOISE_MODELS, RangeFinder, finder_to_dict
+from rangecheck.scan.simulate_noise import photon_noise
+from rangecheck.scan.simulate_time_of_flight import footprint_mm, phases
+from rangecheck.scan.simulate_triangulation import lost_at, on_columns, rounded, swept, triangulation_noise
+from rangecheck.scan.simulate_view import MATT, Caster, Finish, Motion, camera_rays, look
 
-CHUNK = 16384
-#: why a cell holds no distance
-MEASURED, NOTHING_THERE, IN_SHADOW, TOO_OBLIQUE, LOST = range(5)
-REASONS = ("measured", "nothing there", "source's shadow", "too oblique", "lost at random")
+__all__ = [
+    "KINDS", "KINECT", "MATT", "NOISE_MODELS", "REASONS", "Caster", "Finish", "Motion", "RangeFinder", "SimulatedScan",
+    "finder_to_dict", "ring_of_poses", "simulate_scan",
+]  # fmt: skip
 
-
-class Caster(Protocol):
-    """What rays are cast against: `EmbreeCaster`, `BruteCaster` or `ImplicitCaster`."""
-
-    skin_mm: float
-
-    def closest(self, origins_mm: FloatArray, directions: FloatArray) -> Hits: ...
-
-    def occluded(self, origins_mm: FloatArray, directions: FloatArray, reach_mm: FloatArray | float = ...) -> BoolArray: ...
-
-
-@dataclass(frozen=True)
-class RangeFinder:
-    """The instrument.
-
-    source_mm            where the light source is, in the camera's frame; its distance from the camera is the baseline
-    working_distance_mm  range at which `noise_mm` holds
-    noise_mm             standard deviation of range there, at normal incidence
-    fade_deg, limit_deg  cells are lost at random between these angles of incidence (the more oblique of camera and source),
-                         with a chance that rises from 0 to 1 as a smooth step; all are lost beyond
-    lost_share           share of cells lost at random besides
-    step_mm              depth (range, where the camera has no depth axis) is rounded to multiples of this; 0 = not rounded
-    nearest_mm, farthest_mm  ranges outside are not returned
-    """
-
-    source_mm: tuple[float, float, float] = (150.0, 0.0, 0.0)
-    working_distance_mm: float = 600.0
-    noise_mm: float = 0.2
-    fade_deg: float = 65.0
-    limit_deg: float = 82.0
-    lost_share: float = 0.0
-    step_mm: float = 0.02
-    nearest_mm: float = 0.0
-    farthest_mm: float = math.inf
-
-    def __post_init__(self) -> None:
-        if len(self.source_mm) != 3 or not all(math.isfinite(c) for c in self.source_mm):
-            raise SettingError(f"source_mm is {self.source_mm}; it must be three finite coordinates", key="source_mm")
-        for key, low, high in (
-            ("working_distance_mm", 1e-9, math.inf),
-            ("noise_mm", 0.0, math.inf),
-            ("fade_deg", 0.0, 90.0),
-            ("limit_deg", 0.0, 90.0),
-            ("lost_share", 0.0, 1.0),
-            ("step_mm", 0.0, math.inf),
-            ("nearest_mm", 0.0, math.inf),
-            ("farthest_mm", 0.0, math.inf),
-        ):
-            value = getattr(self, key)
-            if not low <= value <= high:
-                raise SettingError(f"{key} is {value}; it must lie between {low:g} and {high:g}", key=key, value=value)
-        if self.fade_deg > self.limit_deg:
-            raise SettingError(
-                f"fade_deg {self.fade_deg} exceeds limit_deg {self.limit_deg}; cells fade before the limit", key="fade_deg"
-            )
-
-    def noise_at(self, range_mm: FloatArray, cos_camera: FloatArray) -> FloatArray:
-        """Standard deviation of range in mm at these ranges and cosines of the angle between normal and camera ray."""
-        return self.noise_mm * (range_mm / self.working_distance_mm) ** 2 / cos_camera
+#: why a cell holds no distance; FLYING holds one, which is false
+MEASURED, NOTHING_THERE, IN_SHADOW, TOO_OBLIQUE, LOST, TOO_DARK, SATURATED, FLYING = range(8)
+REASONS = (
+    "measured", "nothing there", "source's shadow", "too oblique", "lost at random", "too dark", "saturated", "mixed across an edge",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,10 +44,12 @@ class SimulatedScan:
     """A scan and the truth behind it, all on the camera's grid.
 
     scan           what the instrument returned
-    true_range_mm  (h, w) float64 range of the surface, NaN where the ray meets nothing
+    true_range_mm  (h, w) float64 range of the surface at time 0, NaN where the ray meets nothing
     true_normal    (h, w, 3) float64 outward unit normal in the world frame, NaN there too
     noise_mm       (h, w) float64 standard deviation of the error that was drawn, before rounding
-    reason         (h, w) uint8 index into REASONS: MEASURED, NOTHING_THERE, IN_SHADOW, TOO_OBLIQUE or LOST
+    reason         (h, w) uint8 index into REASONS
+    signal         (h, w) float64 light that came back
+    time_s         (h, w) float64 when the cell was measured; 0 unless the subject moves
     """
 
     scan: RangeScan
@@ -110,6 +57,8 @@ class SimulatedScan:
     true_normal: FloatArray = field(repr=False)
     noise_mm: FloatArray = field(repr=False)
     reason: IntArray = field(repr=False)
+    signal: FloatArray = field(repr=False)
+    time_s: FloatArray = field(repr=False)
 
 
 def simulate_scan(
@@ -122,57 +71,89 @@ def simulate_scan(
     scan_index: int = 0,
     name: str = "scan",
     with_brightness: bool = False,
+    finish: Finish = MATT,
+    motion: Motion | None = None,
 ) -> SimulatedScan:
     """One scan of the surface behind `caster` by `finder`, whose camera stands at `world_from_scan` (4, 4).
 
-    Random numbers come from (seed, scan_index) alone. `with_brightness` adds the camera's picture of the surface under the source,
-    white and Lambertian, 1 where it faces the source at the working distance. Raises SettingError or ArrayError."""
+    Random numbers come from (seed, scan_index) alone. `with_brightness` adds the camera's picture of the surface under the source
+    (and the ambient light), in 0..1. `motion` moves the subject while it is scanned; a gray-code scan of a moving subject is not a
+    range image but a set of pictures: see `simulate_gray_code`. Raises SettingError or ArrayError."""
+    if motion is not None and finder.kind == "gray-code":
+        raise SettingError(
+            "a moving subject spoils the code itself; make its pictures with simulate_gray_code and decode them", key="motion"
+        )
     pose = rigid.checked(world_from_scan, "world_from_scan")
     shape = (camera.height, camera.width)
     local_origins, local_rays = camera.pixel_rays()
-    origins = np.ascontiguousarray(rigid.move_points(pose, local_origins).reshape(-1, 3))
-    rays = np.ascontiguousarray(rigid.move_directions(pose, local_rays).reshape(-1, 3))
+    origins, rays = camera_rays(pose, (local_origins, local_rays))
     source = rigid.move_points(pose, np.asarray(finder.source_mm))
-
-    distance, normals = _first_surface(caster, origins, rays)
-    seen = np.isfinite(distance)
-    points = origins + np.where(seen, distance, 0.0)[:, None] * rays
-    cos_camera = np.where(seen, -(normals * rays).sum(axis=1), np.nan)
-    to_source = source - points
-    source_distance = np.linalg.norm(to_source, axis=1)
-    cos_source = (normals * to_source).sum(axis=1) / source_distance
-    lit = seen & (cos_source > 0)
-    lit[lit] = ~_blocked(caster, points[lit], normals[lit], source)
-
+    truth = look(caster, origins, rays, source, finish=finish)
     random = np.random.Generator(np.random.Philox(key=np.array([seed, scan_index], dtype=np.uint64)))
-    error, chance, chance_besides = random.standard_normal(len(rays)), random.random(len(rays)), random.random(len(rays))
-    with np.errstate(invalid="ignore"):
-        oblique_deg = np.degrees(np.arccos(np.clip(np.minimum(cos_camera, cos_source), -1.0, 1.0)))
-        away = seen & ((cos_camera <= 0) | (chance < _lost_at(oblique_deg, finder)))
-        noise = np.where(seen, finder.noise_at(distance, np.maximum(cos_camera, 1e-3)), np.nan)
-    measured = distance + np.where(seen, noise * error, 0.0)
-    measured = _rounded(measured.reshape(shape), local_origins[..., 2], local_rays[..., 2], camera, finder.step_mm).ravel()
+    draws = random.standard_normal(len(rays)), random.random(len(rays)), random.random(len(rays))
+
+    view = truth
+    time: FloatArray = np.zeros(len(rays))
+    flying = np.zeros(len(rays), bool)
+    if finder.kind == "time-of-flight":
+        mixed = phases(
+            caster, camera, pose, np.asarray(finder.source_mm), modulation_mhz=finder.modulation_mhz,
+            working_distance_mm=finder.working_distance_mm, subrays=finder.subrays, finish=finish, motion=motion, sample_s=finder.sample_s,
+        )  # fmt: skip
+        signal, ideal = mixed.amplitude, mixed.range_mm
+        noise = photon_noise(finder.noise_mm, signal, finder.ambient)
+        # a sloping surface spreads over a pixel too
+        slope = np.sqrt(1.0 - np.minimum(view.cos_camera, 1.0) ** 2) / np.maximum(view.cos_camera, 0.1)
+        spread = footprint_mm(camera, np.nan_to_num(ideal)) * (1.0 + np.nan_to_num(slope))
+        flying = mixed.flying(3.0 * noise + spread)
+        seen, lit = np.isfinite(ideal), np.isfinite(ideal)
+    else:
+        if motion is not None:
+            view, time = swept(caster, origins, rays, source, pose, finder, finish, motion)
+        signal, ideal = view.signal(finder.working_distance_mm), view.distance_mm
+        seen, lit = view.seen, view.lit
+        noise = triangulation_noise(finder, view, pose, origins, rays, source, signal)
+        if finder.kind == "gray-code":
+            ideal, noise = on_columns(ideal, local_rays.reshape(-1, 3), finder, camera, draws[0])
+    with np.errstate(invalid="ignore", over="ignore"):
+        noise = np.where(seen, noise, np.nan)
+        error = noise * draws[0] if finder.kind != "gray-code" else np.zeros(len(rays))
+        erred = np.where(seen, ideal + np.where(np.isfinite(error), error, 0.0), np.inf).reshape(shape)
+        measured = rounded(erred, local_origins[..., 2], local_rays[..., 2], camera, finder).ravel()
+        oblique_deg = np.degrees(np.arccos(np.clip(np.minimum(view.cos_camera, view.cos_source), -1.0, 1.0)))
+        away = view.seen & ((view.cos_camera <= 0) | (draws[1] < lost_at(oblique_deg, finder)))
+        contrast = signal / np.maximum(signal + finder.ambient, np.finfo(float).tiny)
 
     reason = np.full(len(rays), MEASURED, np.uint8)
-    outside = (distance < finder.nearest_mm) | (distance > finder.farthest_mm) | ~(measured > 0)
-    reason[(chance_besides < finder.lost_share) | outside] = LOST
-    reason[away] = TOO_OBLIQUE
-    reason[seen & ~lit] = IN_SHADOW
-    reason[~seen] = NOTHING_THERE
+    reason[flying] = FLYING
+    outside = (ideal < finder.nearest_mm) | (ideal > finder.farthest_mm) | ~(measured > 0) | ~np.isfinite(measured)
+    reason[(draws[2] < finder.lost_share) | outside] = LOST
+    reason[signal + finder.ambient > finder.most_signal] = SATURATED
+    reason[(signal < finder.least_signal) | (contrast < finder.least_contrast) | ~(np.isfinite(noise) | ~seen)] = TOO_DARK
+    reason[away & ~flying] = TOO_OBLIQUE
+    reason[~lit & view.seen] = IN_SHADOW
+    reason[~seen & ~view.seen] = NOTHING_THERE
     brightness = None
     if with_brightness:
-        light = np.where(lit, cos_source * (finder.working_distance_mm / source_distance) ** 2, 0.0)
-        brightness = np.clip(light, 0.0, 1.0).astype(np.float32).reshape(shape)
+        picture = np.where(seen, signal + finder.ambient * finish.diffuse, 0.0)
+        brightness = np.clip(picture, 0.0, 1.0).astype(np.float32).reshape(shape)
     scan = RangeScan(
-        np.where(reason == MEASURED, measured, np.nan).astype(np.float32).reshape(shape),
+        np.where((reason == MEASURED) | (reason == FLYING), measured, np.nan).astype(np.float32).reshape(shape),
         camera,
         pose,
         brightness=brightness,
         name=name,
         noise_mm=finder.noise_mm if finder.noise_mm > 0 else None,
     )
-    truth = np.where(seen, distance, np.nan).reshape(shape)
-    return SimulatedScan(scan, truth, normals.reshape(*shape, 3), noise.reshape(shape), reason.reshape(shape))
+    return SimulatedScan(
+        scan,
+        np.where(truth.seen, truth.distance_mm, np.nan).reshape(shape),
+        truth.normals.reshape(*shape, 3),
+        noise.reshape(shape),
+        reason.reshape(shape),
+        signal.reshape(shape),
+        time.reshape(shape),
+    )
 
 
 def ring_of_poses(
@@ -200,71 +181,3 @@ def ring_of_poses(
         outward = [math.sin(azimuth) * math.cos(elevation), math.sin(elevation), math.cos(azimuth) * math.cos(elevation)]
         poses.append(rigid.look_at(target + distance_mm * np.array(outward), target))
     return poses
-
-
-def _first_surface(caster: Caster, origins: FloatArray, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distance (n,) to the first hit, inf where missed, and outward normal (n, 3) there, NaN where missed."""
-    n = len(rays)
-    distance, normals = np.empty(n), np.full((n, 3), np.nan)
-    exact = getattr(caster, "normals", None)
-    corners = None if exact else _corners(caster)
-
-    def work(start: int, end: int) -> None:
-        hits = caster.closest(origins[start:end], rays[start:end])
-        distance[start:end] = hits.distance_mm
-        hit = np.isfinite(hits.distance_mm)
-        if exact:
-            found = exact(origins[start:end][hit] + hits.distance_mm[hit, None] * rays[start:end][hit])
-        else:
-            assert corners is not None
-            a, b, c = (corners[0][corners[1][hits.face[hit], k]] for k in range(3))
-            found = unit_vectors(np.cross(b - a, c - a))
-        normals[start:end][hit] = found
-
-    in_chunks(work, n, CHUNK)
-    return distance, normals
-
-
-def _corners(caster: Caster) -> tuple[FloatArray, IntArray]:
-    vertices, faces = getattr(caster, "vertices", None), getattr(caster, "faces", None)
-    if vertices is None or faces is None:
-        raise SettingError(
-            "the caster gives neither `normals` nor `vertices` and `faces`; the angle of incidence needs one", key="caster"
-        )
-    return vertices, faces
-
-
-def _blocked(caster: Caster, points: FloatArray, normals: FloatArray, source: FloatArray) -> BoolArray:
-    """Whether something stands between each point and the source."""
-    starts = points + caster.skin_mm * normals
-    to_source = source - starts
-    reach = np.linalg.norm(to_source, axis=1)
-    rays = to_source / reach[:, None]
-    blocked = np.empty(len(points), bool)
-
-    def work(start: int, end: int) -> None:
-        blocked[start:end] = caster.occluded(starts[start:end], rays[start:end], reach[start:end])
-
-    in_chunks(work, len(points), CHUNK)
-    return blocked
-
-
-def _lost_at(angle_deg: FloatArray, finder: RangeFinder) -> FloatArray:
-    """Chance that a cell at this angle of incidence returns nothing."""
-    band = finder.limit_deg - finder.fade_deg
-    t = np.clip((angle_deg - finder.fade_deg) / band, 0.0, 1.0) if band > 0 else (angle_deg >= finder.limit_deg).astype(float)
-    # a chance of exactly 1 must lose every draw in [0, 1)
-    return t * t * (3.0 - 2.0 * t)
-
-
-def _rounded(range_mm: FloatArray, origin_z: FloatArray, ray_z: FloatArray, camera: Camera, step_mm: float) -> FloatArray:
-    if step_mm == 0:
-        return range_mm
-    if camera.model == "cylindrical":
-        return np.rint(range_mm / step_mm) * step_mm
-    return (np.rint((range_mm * ray_z + origin_z) / step_mm) * step_mm - origin_z) / ray_z
-
-
-def finder_to_dict(finder: RangeFinder) -> dict[str, object]:
-    """The instrument's numbers, ready for JSON."""
-    return {item.name: getattr(finder, item.name) for item in fields(finder)}
