@@ -1,0 +1,125 @@
+"""`Scene`: a surface, what its parts are made of, and what shines on it. World frame, millimetres."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from rangecheck.arrays import FloatArray, IntArray
+from rangecheck.errors import SceneError
+from rangecheck.reflectance import Material
+from rangecheck.scene.sources import Source
+from rangecheck.scene.surroundings import DARKNESS, Surroundings
+from rangecheck.surface import Surface
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What a picture is taken of.
+
+    surface          the triangles
+    materials        what there is to be made of
+    material_of_part for each of the surface's parts an index into `materials`; empty: all parts are of the first
+    sources          spheres of light
+    surroundings     what shines from infinitely far away
+    smooth           shade with normals interpolated between vertices instead of the faces' own
+    smooth_of_part   the same, part by part, where given
+
+    Radiances hold one number, or one per wavelength of the materials. Raises SceneError when the numbers of wavelengths differ,
+    a part lacks its material, or a source touches the surface."""
+
+    surface: Surface
+    materials: tuple[Material, ...]
+    material_of_part: tuple[int, ...] = ()
+    sources: tuple[Source, ...] = ()
+    surroundings: Surroundings = DARKNESS
+    smooth: bool = False
+    smooth_of_part: tuple[bool, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        parts = len(self.surface.part_names)
+        if not self.materials:
+            raise SceneError("the scene has no material; give it at least one")
+        if not self.material_of_part:
+            object.__setattr__(self, "material_of_part", (0,) * parts)
+        if len(self.material_of_part) != parts:
+            raise SceneError(f"material_of_part names {len(self.material_of_part)} materials for the surface's {parts} parts")
+        if any(not 0 <= m < len(self.materials) for m in self.material_of_part):
+            raise SceneError(f"material_of_part is {self.material_of_part}; there are {len(self.materials)} materials, from 0")
+        if self.smooth_of_part and len(self.smooth_of_part) != parts:
+            raise SceneError(f"smooth_of_part has {len(self.smooth_of_part)} entries for the surface's {parts} parts")
+        if len({m.wavelengths_um for m in self.materials}) > 1:
+            said = ", ".join(f"{m.name} at {m.wavelengths_um} um" for m in self.materials)
+            raise SceneError(f"the materials are given at different wavelengths ({said}); bring them together with Material.at()")
+        counts = {f"source {k}": len(source.radiance) for k, source in enumerate(self.sources)}
+        counts["surroundings"] = self.surroundings.wavelengths
+        for name, count in counts.items():
+            if count not in (1, self.channels):
+                raise SceneError(
+                    f"{name} has {count} radiances and the materials {self.channels} wavelengths; give 1 or {self.channels} radiances"
+                )
+        for source in self.sources:
+            self._keep_apart(source)
+
+    def _keep_apart(self, source: Source) -> None:
+        low, high = self.surface.bounds_mm
+        outside = np.maximum(np.maximum(low - source.centre_mm, source.centre_mm - high), 0.0)
+        if float(np.linalg.norm(outside)) > source.radius_mm or not len(self.surface.faces):
+            return
+        nearest = float(_distance_to_triangles(source.centre_mm, self.surface.triangles).min())
+        if nearest <= source.radius_mm:
+            raise SceneError(
+                f"the source at {np.array2string(source.centre_mm, precision=4)} with radius {source.radius_mm:g} mm reaches into the "
+                f"surface, {nearest:.4g} mm from its centre; points inside a source have no irradiance: move it away or make it smaller",
+                nearest_mm=nearest,
+            )
+
+    @property
+    def channels(self) -> int:
+        """How many wavelengths the scene has: those of its materials."""
+        return len(self.materials[0].wavelengths_um)
+
+    @cached_property
+    def material_of_face(self) -> IntArray:
+        """(m,) int16 index into `materials`."""
+        return np.asarray(self.material_of_part, np.int16)[self.surface.part_of_face]
+
+    @cached_property
+    def corner_normals(self) -> FloatArray:
+        """(m, 3, 3) float32 unit normals at each face's corners: the vertices' where smooth, else the face's own; faces without
+        area get +z, which no ray ever sees."""
+        flat = np.nan_to_num(self.surface.face_normals)
+        flat[(flat == 0).all(axis=1)] = (0.0, 0.0, 1.0)
+        normals = np.repeat(flat[:, None, :], 3, axis=1).astype(np.float32)
+        smooth = self.smooth_of_part or (self.smooth,) * len(self.surface.part_names)
+        chosen = np.asarray(smooth)[self.surface.part_of_face]
+        if chosen.any():
+            rounded = self.surface.vertex_normals[self.surface.faces[chosen]]
+            blank = (rounded == 0).all(axis=-1, keepdims=True)
+            normals[chosen] = np.where(blank, normals[chosen], rounded)
+        return normals
+
+    def at(self, wavelengths_um: Sequence[float]) -> Scene:
+        """The same scene at other wavelengths; its lights must be grey or already have that many radiances."""
+        return replace(self, materials=tuple(m.at(wavelengths_um) for m in self.materials))
+
+    def lit_by(self, sources: tuple[Source, ...], surroundings: Surroundings | None = None) -> Scene:
+        """The same things under other light."""
+        return replace(self, sources=sources, surroundings=self.surroundings if surroundings is None else surroundings)
+
+
+def _distance_to_triangles(point: FloatArray, triangles: FloatArray) -> FloatArray:
+    """(m,) distances of a point from triangles (m, 3, 3): to the plane where its foot lies inside, else to the nearest edge."""
+    a = triangles
+    edges = np.roll(a, -1, axis=1) - a
+    away = point - a
+    with np.errstate(invalid="ignore", divide="ignore"):
+        along = np.clip(np.nan_to_num((away * edges).sum(-1) / (edges * edges).sum(-1)), 0.0, 1.0)
+        to_edge = np.linalg.norm(away - along[..., None] * edges, axis=-1).min(axis=1)
+        normal = np.cross(edges[:, 0], edges[:, 1])
+        inside = (np.einsum("mij,mj->mi", np.cross(edges, away), normal) >= 0).all(axis=1)
+        to_plane = np.abs((away[:, 0] * normal).sum(-1)) / np.linalg.norm(normal, axis=-1)
+    return np.where(inside & np.isfinite(to_plane), np.fmin(to_plane, to_edge), to_edge)

@@ -1,0 +1,122 @@
+"""From pixels to rays, in the caster's local frame (centred, scaled to the object), float32, unit directions.
+
+Pixels are visited in tiles of 64 x 64, and within a tile in blocks of 4 x 4, so that sixteen neighbours in the list are neighbours
+in the picture. Pixel coordinates as in `optics`: integers at pixel centres.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+
+from rangecheck.arrays import FloatArray, IntArray
+from rangecheck.kernels import inline_kernel, stage_kernel
+from rangecheck.optics import Camera, OrthographicCamera, PinholeCamera
+from rangecheck.transport.chance import PIXEL, key_of, point, stream_of
+from rangecheck.transport.queues import CAMERA
+
+TILE, BLOCK = 64, 4
+
+
+@lru_cache(maxsize=8)
+def pixel_order(width: int, height: int) -> IntArray:
+    """(width height,) int32 pixel numbers (row width + column), tile by tile and block by block."""
+    rows, columns = np.arange(height, dtype=np.int64), np.arange(width, dtype=np.int64)
+
+    def keys(index: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+        return index // TILE, index % TILE // BLOCK, index % BLOCK
+
+    row, column = keys(rows), keys(columns)
+    # a number that sorts by tile, block, place in block
+    parts = [(r[:, None], c[None, :]) for r, c in zip(row, column)]
+    sizes = (math.ceil(width / TILE), TILE // BLOCK, BLOCK)
+    rank = np.zeros((height, width), np.int64)
+    for (r, c), across, down in zip(parts, sizes, (math.ceil(height / TILE), TILE // BLOCK, BLOCK)):
+        rank = (rank * down + r) * across + c
+    order = np.argsort(rank.ravel(), kind="stable").astype(np.int32)
+    order.flags.writeable = False
+    return order
+
+
+class PictureRays:
+    """The rays of one camera at one pose, as the caster wants them."""
+
+    def __init__(self, camera: Camera, world_from_camera: FloatArray, centre_mm: FloatArray, scale_mm: float) -> None:
+        self.camera = camera
+        self.rotation = np.ascontiguousarray(world_from_camera[:3, :3])
+        self.eye = (world_from_camera[:3, 3] - centre_mm) / scale_mm
+        self.scale_mm = scale_mm
+        if type(camera) is PinholeCamera and not any(camera.distortion):
+            self._numbers = np.array([0.0, camera.fx, camera.fy, camera.cx, camera.cy])
+        elif type(camera) is OrthographicCamera:
+            self._numbers = np.array([1.0, camera.pixel_mm / scale_mm, camera.pixel_mm / scale_mm, camera.cx, camera.cy])
+        else:
+            self._numbers = np.empty(0)
+
+    def fill(self, u: FloatArray, v: FloatArray, origins: FloatArray, directions: FloatArray) -> None:
+        """Write the rays at pixel coordinates u, v (n,) float64 into origins and directions (n, 3) float32."""
+        if len(self._numbers):
+            _simple_rays(self._numbers, self.rotation, self.eye, u, v, origins, directions)
+            return
+        places, rays = self.camera.rays(u, v)
+        _moved_rays(
+            np.ascontiguousarray(places / self.scale_mm), np.ascontiguousarray(rays), self.rotation, self.eye, origins, directions
+        )
+
+
+@stage_kernel
+def start_rays(pixels, width, centre, seed, number, places, rays):
+    """Pixel coordinates places (2, n) of sample `number` of each pixel, and rays that carry all the light that they find."""
+    channels = rays.weight.shape[1]
+    for i in range(len(pixels)):
+        pixel = pixels[i]
+        row = pixel // width
+        places[0, i], places[1, i] = pixel - row * width, row
+        stream = stream_of(seed, pixel)
+        if not centre:
+            x, y = point(key_of(stream, PIXEL), number)
+            places[0, i] += x - 0.5
+            places[1, i] += y - 0.5
+        rays.far[i] = math.inf
+        rays.pixel[i], rays.stream[i] = i, stream
+        rays.kind[i] = rays.first[i] = CAMERA
+        for c in range(channels):
+            rays.weight[i, c] = 1.0
+
+
+@inline_kernel
+def _put_ray(rotation, eye, px, py, pz, dx, dy, dz, origins, directions, i):
+    """Turn a camera-frame ray into the local frame and start it near the object, so that float32 counts from there."""
+    wx = rotation[0, 0] * dx + rotation[0, 1] * dy + rotation[0, 2] * dz
+    wy = rotation[1, 0] * dx + rotation[1, 1] * dy + rotation[1, 2] * dz
+    wz = rotation[2, 0] * dx + rotation[2, 1] * dy + rotation[2, 2] * dz
+    ox = eye[0] + rotation[0, 0] * px + rotation[0, 1] * py + rotation[0, 2] * pz
+    oy = eye[1] + rotation[1, 0] * px + rotation[1, 1] * py + rotation[1, 2] * pz
+    oz = eye[2] + rotation[2, 0] * px + rotation[2, 1] * py + rotation[2, 2] * pz
+    skip = max(0.0, -(ox * wx + oy * wy + oz * wz) - 2.0)
+    origins[i, 0], origins[i, 1], origins[i, 2] = ox + skip * wx, oy + skip * wy, oz + skip * wz
+    directions[i, 0], directions[i, 1], directions[i, 2] = wx, wy, wz
+
+
+@stage_kernel
+def _simple_rays(numbers, rotation, eye, u, v, origins, directions):
+    """Pinhole (x/z, y/z) and orthographic rays."""
+    parallel, fx, fy, cx, cy = numbers[0] == 1.0, numbers[1], numbers[2], numbers[3], numbers[4]
+    for i in range(len(u)):
+        if parallel:
+            _put_ray(rotation, eye, (u[i] - cx) * fx, (v[i] - cy) * fy, 0.0, 0.0, 0.0, 1.0, origins, directions, i)
+        else:
+            x, y = (u[i] - cx) / fx, (v[i] - cy) / fy
+            size = 1.0 / math.sqrt(x * x + y * y + 1.0)
+            _put_ray(rotation, eye, 0.0, 0.0, 0.0, x * size, y * size, size, origins, directions, i)
+
+
+@stage_kernel
+def _moved_rays(places, rays, rotation, eye, origins, directions):
+    """Any other camera's rays, given in its own frame."""
+    for i in range(len(places)):
+        _put_ray(
+            rotation, eye, places[i, 0], places[i, 1], places[i, 2], rays[i, 0], rays[i, 1], rays[i, 2], origins, directions, i
+        )

@@ -1,0 +1,88 @@
+"""Sample points: scrambled (0, 2)-sequences, so that the samples of one pixel are spread evenly however many are taken.
+
+Each point is a pure function of (seed, pixel, branch of the path, purpose, number): the same on any number of threads. Sobol' points with nested
+uniform (Owen) scrambling by hashing: Laine & Karras, *Stratified sampling for stochastic transparency*, 2011; the hash constants are
+those of Burley, *Practical hash-based Owen scrambling*, 2020.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rangecheck.kernels import stage_kernel
+
+#: what a key is for; a branch of a path is BRANCH plus its number, a source SHADOW plus its number
+PIXEL, LOBE_WAY, DIFFUSE_WAY, CHOICE, ORDER, SHADOW, BRANCH = 1, 2, 3, 4, 5, 1 << 16, 1 << 24
+
+_TO_UNIT = 1.0 / 4294967296.0
+
+
+def _second_dimension():
+    """(4, 256) what each byte of an index adds (modulo 2) to Sobol's second dimension: Pascal's triangle modulo 2."""
+    directions = np.zeros(32, np.uint32)
+    directions[0] = 1 << 31
+    for k in range(1, 32):
+        directions[k] = directions[k - 1] ^ (directions[k - 1] >> np.uint32(1))
+    table = np.zeros((4, 256), np.uint32)
+    for byte in range(4):
+        for bit in range(8):
+            table[byte] ^= np.where(np.arange(256) >> bit & 1, directions[8 * byte + bit], 0).astype(np.uint32)
+    return table
+
+
+_SECOND = _second_dimension()
+
+
+@stage_kernel
+def _mixed(x):
+    """A good 32-bit hash (lowbias32)."""
+    x = np.uint32(x)
+    x = np.uint32((x ^ (x >> np.uint32(16))) * np.uint32(0x7FEB352D))
+    x = np.uint32((x ^ (x >> np.uint32(15))) * np.uint32(0x846CA68B))
+    return np.uint32(x ^ (x >> np.uint32(16)))
+
+
+@stage_kernel
+def stream_of(seed, pixel):
+    """The 32-bit number from which all chance along one pixel's path comes."""
+    return _mixed(np.uint32(_mixed(np.uint32(seed) + np.uint32(0x9E3779B9)) ^ np.uint32(pixel)) + np.uint32(0x85EBCA6B))
+
+
+@stage_kernel
+def key_of(stream, purpose):
+    """Which sequence serves `purpose`; also the stream of a path's branch, with the branch's number as purpose."""
+    return _mixed(np.uint32(np.uint32(stream) ^ np.uint32(purpose)) + np.uint32(0xC2B2AE35))
+
+
+@stage_kernel
+def _reversed_bits(x):
+    x = np.uint32(x)
+    x = np.uint32((x << np.uint32(16)) | (x >> np.uint32(16)))
+    x = np.uint32(((x & np.uint32(0x00FF00FF)) << np.uint32(8)) | ((x & np.uint32(0xFF00FF00)) >> np.uint32(8)))
+    x = np.uint32(((x & np.uint32(0x0F0F0F0F)) << np.uint32(4)) | ((x & np.uint32(0xF0F0F0F0)) >> np.uint32(4)))
+    x = np.uint32(((x & np.uint32(0x33333333)) << np.uint32(2)) | ((x & np.uint32(0xCCCCCCCC)) >> np.uint32(2)))
+    return np.uint32(((x & np.uint32(0x55555555)) << np.uint32(1)) | ((x & np.uint32(0xAAAAAAAA)) >> np.uint32(1)))
+
+
+@stage_kernel
+def _scrambled(x, key):
+    """Nested uniform scramble of a fraction given as 32 bits."""
+    x = _reversed_bits(x)
+    x = np.uint32(x ^ (x * np.uint32(0x3D20ADEA)))
+    x = np.uint32(x + np.uint32(key))
+    x = np.uint32(x * ((np.uint32(key) >> np.uint32(16)) | np.uint32(1)))
+    x = np.uint32(x ^ (x * np.uint32(0x05526C56)))
+    x = np.uint32(x ^ (x * np.uint32(0x53A22864)))
+    return _reversed_bits(x)
+
+
+@stage_kernel
+def point(key, number):
+    """The `number`-th point (two numbers in [0, 1)) of the sequence `key`."""
+    index = _scrambled(np.uint32(number), np.uint32(key))
+    first = _reversed_bits(index)
+    second = _SECOND[0, index & np.uint32(255)] ^ _SECOND[1, (index >> np.uint32(8)) & np.uint32(255)]
+    second ^= _SECOND[2, (index >> np.uint32(16)) & np.uint32(255)] ^ _SECOND[3, index >> np.uint32(24)]
+    a = _scrambled(first, _mixed(np.uint32(key) ^ np.uint32(0xA511E9B3)))
+    b = _scrambled(second, _mixed(np.uint32(key) ^ np.uint32(0x63D83595)))
+    return a * _TO_UNIT, b * _TO_UNIT

@@ -1,0 +1,115 @@
+"""What a camera collected: mean radiance per pixel, how sure it is, and where the light came from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from rangecheck.arrays import FloatArray, IntArray
+from rangecheck.errors import CameraError
+from rangecheck.kernels import stage_kernel
+from rangecheck.optics import Camera
+from rangecheck.transport.queues import KIND_NAMES
+
+
+@dataclass(frozen=True, eq=False)
+class Film:
+    """A rendered picture, linear.
+
+    radiance  (h, w, c) float32, as of the scene's sources
+    coverage  (h, w) float32, share of the pixel's samples that met a surface
+    variance  (h, w, c) float32 of `radiance`, estimated from the samples' own spread as if they were independent (they are
+              spread evenly, so that it is an upper estimate); NaN where a single sample was taken
+    samples   (h, w) int32 samples per pixel
+    budget    (first reflection, number of reflections, light): radiance summed over samples and wavelengths, divided by pixels x passes
+    lights    names of the lights, the surroundings last
+    """
+
+    radiance: FloatArray = field(repr=False)
+    coverage: FloatArray = field(repr=False)
+    variance: FloatArray = field(repr=False)
+    samples: IntArray = field(repr=False)
+    budget: FloatArray = field(repr=False)
+    lights: tuple[str, ...] = ()
+
+    @property
+    def mean_radiance(self) -> float:
+        """Over the frame and its wavelengths."""
+        return float(self.radiance.mean(dtype=np.float64))
+
+    def standard_error(self) -> float:
+        """Root mean square over the frame of each pixel's standard error, from `variance`; NaN when a pixel has a single sample."""
+        return float(np.sqrt(self.variance.mean(dtype=np.float64)))
+
+    def shares(self) -> dict[str, dict[str, float]]:
+        """The light budget: share (0..1) of the frame's radiance by source, by number of reflections, by first reflection."""
+        total = float(self.budget.sum())
+        if not total > 0:
+            return {"light": {}, "reflections": {}, "reflection": {}}
+        reflections = {str(count): float(light) for count, light in enumerate(self.budget.sum(axis=(0, 2)))}
+        parts: dict[str, dict[str, float]] = {
+            "light": dict(zip(self.lights, self.budget.sum(axis=(0, 1)).tolist())),
+            "reflections": reflections,
+            "reflection": dict(zip(KIND_NAMES, self.budget.sum(axis=(1, 2)).tolist())),
+        }
+        return {name: {key: value / total for key, value in part.items()} for name, part in parts.items()}
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready summary, without the picture."""
+        return {
+            "mean_radiance": self.mean_radiance,
+            "covered": float(self.coverage.mean()),
+            "samples_per_pixel": float(self.samples.mean()),
+            "shares": self.shares(),
+        }
+
+
+def image_irradiance(film: Film, camera: Camera, lens_diameter_mm: float, focal_length_mm: float) -> FloatArray:
+    """(h, w, c) irradiance of the image plane, equation (15): L (pi/4) (d/f)^2 cos^4 gamma, gamma the ray's angle to the axis."""
+    if not (lens_diameter_mm > 0 and focal_length_mm > 0):
+        raise CameraError(f"lens diameter is {lens_diameter_mm} mm and focal length {focal_length_mm} mm; both must be positive")
+    cosine = camera.pixel_rays()[1][..., 2]
+    falloff = 0.25 * np.pi * (lens_diameter_mm / focal_length_mm) ** 2 * cosine**4
+    return (film.radiance * falloff[..., None]).astype(np.float32)
+
+
+class Plate:
+    """The film while it is exposed: running mean and squared deviations per pixel (Welford 1962)."""
+
+    def __init__(self, height: int, width: int, channels: int) -> None:
+        self.shape = (height, width)
+        n = height * width
+        self.mean = np.zeros((n, channels), np.float32)
+        self.spread = np.zeros((n, channels), np.float32)
+        self.covered = np.zeros(n, np.int32)
+        self.count = np.zeros(n, np.int32)
+
+    def develop(self, budget: FloatArray, lights: tuple[str, ...]) -> Film:
+        """The film."""
+        count = self.count[:, None].astype(np.float32)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            variance = np.where(count > 1, self.spread / (count * (count - 1)), np.float32(np.nan)).astype(np.float32)
+            coverage = np.where(self.count > 0, self.covered / np.maximum(self.count, 1), 0).astype(np.float32)
+        return Film(
+            radiance=self.mean.reshape(*self.shape, -1),
+            coverage=coverage.reshape(self.shape),
+            variance=variance.reshape(*self.shape, -1),
+            samples=self.count.reshape(self.shape),
+            budget=budget,
+            lights=lights,
+        )
+
+
+@stage_kernel
+def expose(pixels, sample, face, mean, spread, covered, count):
+    """Add one sample of each pixel; `face` says whether its ray met a surface."""
+    for i in range(len(pixels)):
+        pixel = pixels[i]
+        count[pixel] += 1
+        covered[pixel] += face[i] >= 0
+        for c in range(sample.shape[1]):
+            before = sample[i, c] - mean[pixel, c]
+            mean[pixel, c] += before / count[pixel]
+            spread[pixel, c] += before * (sample[i, c] - mean[pixel, c])

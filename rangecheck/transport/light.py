@@ -1,0 +1,147 @@
+"""Stage: light that comes straight from the sources, equations (19)-(22) with the report's missing albedos put back.
+
+The diffuse part uses the exact irradiance of a sphere, also where the horizon cuts it. `rays_per_source` 0 aims one shadow ray at
+the middle of each source, and takes the lobe there; k > 0 spreads k over the source's solid angle: soft shadows.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from rangecheck.kernels import inline_kernel, stage_kernel
+from rangecheck.scene.sources import form_factor
+from rangecheck.transport.chance import SHADOW, key_of, point
+from rangecheck.transport.queues import DIFFUSE, LOBE
+from rangecheck.transport.reflection import diffuse_of, lobe_of
+
+
+@inline_kernel
+def _put_shadow(shadows, k, hits, i, dx, dy, dz, far, source):
+    """Shadow ray k from hit i."""
+    for axis in range(3):
+        shadows.origin[k, axis] = hits.place[i, axis]
+    shadows.direction[k, 0], shadows.direction[k, 1], shadows.direction[k, 2] = dx, dy, dz
+    shadows.far[k] = far
+    shadows.pixel[k], shadows.first[k], shadows.source[k] = hits.pixel[i], hits.first[i], source
+
+
+@stage_kernel
+def _put_gain(shadows, k, hits, i, materials, sources, source, dx, dy, dz, cosine, diffuse_light, lobe_light):
+    """What shadow ray k brings: weight x (K_lm/pi x diffuse_light + K_sl f x lobe_light) x radiance; whether that is anything."""
+    material = hits.material[i]
+    nx, ny, nz = float(hits.shading[i, 0]), float(hits.shading[i, 1]), float(hits.shading[i, 2])
+    vx, vy, vz = -float(hits.arriving[i, 0]), -float(hits.arriving[i, 1]), -float(hits.arriving[i, 2])
+    total = diffuse = 0.0
+    for c in range(shadows.gain.shape[1]):
+        weight = hits.weight[i, c] * sources.radiance[source, c]
+        part = weight * diffuse_of(materials, material, c) * diffuse_light / math.pi
+        gain = part
+        if lobe_light > 0.0:
+            toward = vx * dx + vy * dy + vz * dz
+            gain += weight * lobe_light * lobe_of(materials, material, c, cosine, vx * nx + vy * ny + vz * nz, toward)
+        shadows.gain[k, c] = gain
+        total += gain
+        diffuse += part
+    shadows.diffuse_share[k] = diffuse / total if total > 0.0 else 0.0
+    return total > 0.0
+
+
+@stage_kernel
+def aim(sources, materials, hits, start, stop, rays_per_source, number, with_diffuse, with_lobe, shadows):
+    """Shadow rays from hits start..stop to all sources; returns how many. Source by source, so that neighbours stay neighbours."""
+    k = np.int64(0)
+    for s in range(len(sources.radius)):
+        r2 = sources.radius[s] * sources.radius[s]
+        for i in range(start, stop):
+            material = hits.material[i]
+            nx, ny, nz = float(hits.shading[i, 0]), float(hits.shading[i, 1]), float(hits.shading[i, 2])
+            x = sources.centre[s, 0] - hits.place[i, 0]
+            y = sources.centre[s, 1] - hits.place[i, 1]
+            z = sources.centre[s, 2] - hits.place[i, 2]
+            d2 = x * x + y * y + z * z
+            distance = math.sqrt(d2)
+            x, y, z = x / distance, y / distance, z / distance
+            cosine = x * nx + y * ny + z * nz
+            factor = form_factor(cosine, min(1.0, r2 / d2))
+            if factor <= 0.0:
+                continue
+            diffuse_light = math.pi * factor if with_diffuse else 0.0
+            shines = with_lobe and materials.shiny[material]
+            if rays_per_source == 0:
+                lobe_light = math.pi * factor if shines and cosine > 0.0 else 0.0
+                if _put_gain(shadows, k, hits, i, materials, sources, s, x, y, z, cosine, diffuse_light, lobe_light):
+                    _put_shadow(shadows, k, hits, i, x, y, z, distance - sources.radius[s], s)
+                    k += 1
+                continue
+            k = _aim_soft(
+                sources, materials, hits, i, s, x, y, z, distance, rays_per_source, number, diffuse_light, shines, shadows, k
+            )  # fmt: skip
+    return k
+
+
+@stage_kernel
+def _aim_soft(
+    sources, materials, hits, i, s, x, y, z, distance, rays, number, diffuse_light, shines, shadows, k
+):  # fmt: skip
+    """Rays spread evenly over the solid angle of source s; together they carry exactly the unshadowed diffuse irradiance."""
+    nx, ny, nz = float(hits.shading[i, 0]), float(hits.shading[i, 1]), float(hits.shading[i, 2])
+    sine2 = min(1.0, (sources.radius[s] / distance) ** 2)
+    depth = sine2 / (1.0 + math.sqrt(1.0 - sine2))
+    sign = 1.0 if z >= 0.0 else -1.0
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    key = key_of(hits.stream[i], SHADOW + s)
+    first, cosines = k, 0.0
+    for j in range(rays):
+        p, q = point(key, number * rays + j)
+        along = 1.0 - p * depth
+        aside = math.sqrt(max(0.0, 1.0 - along * along))
+        turn = 2.0 * math.pi * q
+        e, f = aside * math.cos(turn), aside * math.sin(turn)
+        # basis around (x, y, z): Duff et al., Building an orthonormal basis, revisited, 2017
+        dx = along * x + e * (1.0 + sign * x * x * a) + f * b
+        dy = along * y + e * sign * b + f * (sign + y * y * a)
+        dz = along * z - e * sign * x - f * y
+        cosine = dx * nx + dy * ny + dz * nz
+        if cosine <= 0.0:
+            continue
+        reach = distance * (along - math.sqrt(max(0.0, sine2 - aside * aside)))
+        # the cosine waits in `far` until all are known
+        _put_shadow(shadows, k, hits, i, dx, dy, dz, reach, s)
+        shadows.diffuse_share[k] = cosine
+        cosines += cosine
+        k += 1
+    last, k = k, first
+    solid_angle = 2.0 * math.pi * depth
+    for j in range(first, last):
+        cosine = float(shadows.diffuse_share[j])
+        dx, dy, dz = float(shadows.direction[j, 0]), float(shadows.direction[j, 1]), float(shadows.direction[j, 2])
+        lobe_light = cosine * solid_angle / rays if shines else 0.0
+        reach = float(shadows.far[j])
+        if _put_gain(
+            shadows, k, hits, i, materials, sources, s, dx, dy, dz, cosine, diffuse_light * cosine / cosines, lobe_light
+        ):
+            _put_shadow(shadows, k, hits, i, dx, dy, dz, reach, s)
+            k += 1
+    return k
+
+
+@stage_kernel
+def add_light(shadows, n, reflections, sample, tally):
+    """Add what no surface blocks to `sample` and to the tally, as light that was reflected so many times."""
+    for k in range(n):
+        if shadows.blocked[k]:
+            continue
+        pixel, source = shadows.pixel[k], shadows.source[k]
+        light = 0.0
+        for c in range(sample.shape[1]):
+            sample[pixel, c] += shadows.gain[k, c]
+            light += shadows.gain[k, c]
+        if reflections == 1:
+            diffuse = light * shadows.diffuse_share[k]
+            tally[DIFFUSE, 1, source] += diffuse
+            tally[LOBE, 1, source] += light - diffuse
+        else:
+            tally[shadows.first[k], reflections, source] += light

@@ -1,0 +1,78 @@
+"""Stage: rays that have been cast meet a source, a surface, or the surroundings; equations (23)-(31), one recursion step each.
+
+Light is tallied as it arrives: tally[first reflection, number of reflections, light], light 0 .. s-1 the sources, s the
+surroundings; sums over pixels and wavelengths, divided at the end.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from rangecheck.kernels import inline_kernel, stage_kernel
+from rangecheck.scene.surroundings import add_surroundings
+from rangecheck.transport.geometry import place_hit
+from rangecheck.transport.queues import CAMERA, SPIKE
+
+
+@inline_kernel
+def source_ahead(centre, radius, ox, oy, oz, dx, dy, dz, far):
+    """Index of the nearest source nearer than `far` on the ray, or -1."""
+    found, nearest = np.int64(-1), far
+    for s in range(len(radius)):
+        x, y, z = centre[s, 0] - ox, centre[s, 1] - oy, centre[s, 2] - oz
+        along = x * dx + y * dy + z * dz
+        if along > 0.0:
+            # the distance of the centre from the ray, squared: from the cross product, which keeps its digits far away
+            cx, cy, cz = y * dz - z * dy, z * dx - x * dz, x * dy - y * dx
+            rest = radius[s] * radius[s] - cx * cx - cy * cy - cz * cz
+            if rest > 0.0:
+                distance = along - math.sqrt(rest)
+                if 0.0 < distance < nearest:
+                    found, nearest = np.int64(s), distance
+    return found
+
+
+@stage_kernel
+def meet(geometry, sources, surroundings, rays, n, reflections, backdrop, gather_sources, hits, sample, tally):
+    """Sort n cast rays: light that they see is added to `sample`, surfaces that they hit are written to `hits`.
+
+    backdrop: the camera itself sees surroundings. gather_sources: rays that mirror see sources (else another way accounts for
+    them); rays that gather over a lobe or a hemisphere never do, for sources light surfaces directly. Returns the number of hits."""
+    # taken apart once, not ray by ray
+    corners, normals, materials, skin = geometry
+    centre, radius, radiance = sources
+    sky, frame, period, softness, low, high, picture, boxes, glow = surroundings
+    origin, direction, far, faces, us, vs, weight, pixels, kinds, firsts, streams = rays
+    place, shading, facing, arriving, hit_weight, hit_pixel, hit_first, hit_material, hit_stream = hits
+    count = np.int64(0)
+    channels = sample.shape[1]
+    for i in range(n):
+        face, kind, pixel = faces[i], kinds[i], pixels[i]
+        dx, dy, dz = float(direction[i, 0]), float(direction[i, 1]), float(direction[i, 2])
+        if len(radius) > 0 and (kind == CAMERA or (kind == SPIKE and gather_sources)):
+            reach = float(far[i]) if face >= 0 else math.inf
+            ox, oy, oz = float(origin[i, 0]), float(origin[i, 1]), float(origin[i, 2])
+            seen = source_ahead(centre, radius, ox, oy, oz, dx, dy, dz, reach)
+            if seen >= 0:
+                for c in range(channels):
+                    light = weight[i, c] * radiance[seen, c]
+                    sample[pixel, c] += light
+                    tally[firsts[i], reflections, seen] += light
+                continue
+        if face < 0:
+            if kind != CAMERA or backdrop:
+                tally[firsts[i], reflections, len(radius)] += add_surroundings(
+                    sky, frame, period, softness, low, high, picture, boxes, glow, dx, dy, dz, weight, i, sample, pixel
+                )
+            continue
+        place_hit(corners, normals, skin, face, float(us[i]), float(vs[i]), dx, dy, dz, place, shading, facing, count)
+        for axis in range(3):
+            arriving[count, axis] = direction[i, axis]
+        for c in range(channels):
+            hit_weight[count, c] = weight[i, c]
+        hit_pixel[count], hit_first[count], hit_stream[count] = pixel, firsts[i], streams[i]
+        hit_material[count] = materials[face]
+        count += 1
+    return count

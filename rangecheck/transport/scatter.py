@@ -1,0 +1,189 @@
+"""Stage: surfaces send on the light they wait for; equations (24), (32)-(43).
+
+Each hit asks for light along the mirror direction (spike), over the lobe's effective area, and over the hemisphere (diffuse, which the
+report sets to 0 in (44)). `split` sends rays for each of the three; `choose_one` sends one ray for all, with weights that
+keep the mean. Rays leave above the face and above the shading normal's horizon, or not at all.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from rangecheck.kernels import stage_kernel
+from rangecheck.transport.chance import BRANCH, CHOICE, DIFFUSE_WAY, key_of, point
+from rangecheck.transport.queues import CAMERA, DIFFUSE, LOBE, SPIKE
+from rangecheck.transport.reflection import diffuse_of, draw_lobe, lobe_guess, lobe_of, spike_of
+
+
+@stage_kernel
+def frame_around(z0, z1, z2):
+    """Two unit vectors that make a right-handed frame with the unit vector z (Duff et al. 2017)."""
+    sign = 1.0 if z2 >= 0.0 else -1.0
+    a = -1.0 / (sign + z2)
+    b = z0 * z1 * a
+    return 1.0 + sign * z0 * z0 * a, sign * b, -sign * z0, b, sign + z1 * z1 * a, -z1
+
+
+@stage_kernel
+def mirror_ray(hits, i):
+    """Direction in which hit i mirrors, kept just above its face."""
+    nx, ny, nz = float(hits.shading[i, 0]), float(hits.shading[i, 1]), float(hits.shading[i, 2])
+    dx, dy, dz = float(hits.arriving[i, 0]), float(hits.arriving[i, 1]), float(hits.arriving[i, 2])
+    twice = -2.0 * (dx * nx + dy * ny + dz * nz)
+    x, y, z = dx + twice * nx, dy + twice * ny, dz + twice * nz
+    fx, fy, fz = float(hits.facing[i, 0]), float(hits.facing[i, 1]), float(hits.facing[i, 2])
+    above = x * fx + y * fy + z * fz
+    if above < 1e-4:
+        x, y, z = x + (1e-4 - above) * fx, y + (1e-4 - above) * fy, z + (1e-4 - above) * fz
+    size = 1.0 / math.sqrt(x * x + y * y + z * z)
+    return x * size, y * size, z * size
+
+
+@stage_kernel
+def _send(rays, k, hits, i, dx, dy, dz, kind, branch):
+    """Ray k leaves hit i; its weight is already written."""
+    for axis in range(3):
+        rays.origin[k, axis] = hits.place[i, axis]
+    rays.direction[k, 0], rays.direction[k, 1], rays.direction[k, 2] = dx, dy, dz
+    rays.far[k] = math.inf
+    rays.pixel[k], rays.kind[k] = hits.pixel[i], kind
+    rays.first[k] = kind if hits.first[i] == CAMERA else hits.first[i]
+    rays.stream[k] = key_of(hits.stream[i], BRANCH + branch)
+
+
+@stage_kernel
+def _clear_of_face(hits, i, dx, dy, dz):
+    return dx * hits.facing[i, 0] + dy * hits.facing[i, 1] + dz * hits.facing[i, 2] > 0.0
+
+
+@stage_kernel
+def _send_spike(materials, hits, i, share, least, rays, k, branch):
+    """The mirror ray, equation (34), unless it carries no more than `least`; returns the number of rays sent."""
+    cosine = -(
+        hits.arriving[i, 0] * hits.shading[i, 0]
+        + hits.arriving[i, 1] * hits.shading[i, 1]
+        + hits.arriving[i, 2] * hits.shading[i, 2]
+    )
+    most = 0.0
+    for c in range(rays.weight.shape[1]):
+        weight = hits.weight[i, c] * spike_of(materials, hits.material[i], c, float(cosine)) / share
+        rays.weight[k, c] = weight
+        most = max(most, weight)
+    if most <= least:
+        return 0
+    x, y, z = mirror_ray(hits, i)
+    _send(rays, k, hits, i, x, y, z, SPIKE, branch)
+    return 1
+
+
+@stage_kernel
+def _send_lobe(materials, hits, i, share, least, number, rays, k, branch):
+    """One ray drawn by scattering order; `share` of such rays make the estimate."""
+    material = hits.material[i]
+    nx, ny, nz = float(hits.shading[i, 0]), float(hits.shading[i, 1]), float(hits.shading[i, 2])
+    vx, vy, vz = -float(hits.arriving[i, 0]), -float(hits.arriving[i, 1]), -float(hits.arriving[i, 2])
+    cosine = vx * nx + vy * ny + vz * nz
+    p, q, r, density = draw_lobe(materials, material, cosine, key_of(hits.stream[i], BRANCH + branch), number)
+    if r <= 0.0:
+        return 0
+    # the frame's x axis is the viewer's tangential part; where there is none, any will do
+    ax, ay, az = vx - cosine * nx, vy - cosine * ny, vz - cosine * nz
+    sine = math.sqrt(ax * ax + ay * ay + az * az)
+    if sine > 1e-6:
+        ax, ay, az = ax / sine, ay / sine, az / sine
+    else:
+        ax, ay, az, _, _, _ = frame_around(nx, ny, nz)
+    bx, by, bz = ny * az - nz * ay, nz * ax - nx * az, nx * ay - ny * ax
+    dx, dy, dz = p * ax + q * bx + r * nx, p * ay + q * by + r * ny, p * az + q * bz + r * nz
+    if not (density > 0.0 and _clear_of_face(hits, i, dx, dy, dz)):
+        return 0
+    toward = vx * dx + vy * dy + vz * dz
+    most = 0.0
+    for c in range(rays.weight.shape[1]):
+        weight = hits.weight[i, c] * lobe_of(materials, material, c, r, cosine, toward) * r / (density * share)
+        rays.weight[k, c] = weight
+        most = max(most, weight)
+    if not most > least:
+        return 0
+    _send(rays, k, hits, i, dx, dy, dz, LOBE, branch)
+    return 1
+
+
+@stage_kernel
+def _send_diffuse(materials, hits, i, share, least, number, rays, k, branch):
+    """One ray of the hemisphere, drawn by its cosine."""
+    material = hits.material[i]
+    most = 0.0
+    for c in range(rays.weight.shape[1]):
+        weight = hits.weight[i, c] * diffuse_of(materials, material, c) / share
+        rays.weight[k, c] = weight
+        most = max(most, weight)
+    if most <= least:
+        return 0
+    nx, ny, nz = float(hits.shading[i, 0]), float(hits.shading[i, 1]), float(hits.shading[i, 2])
+    ax, ay, az, bx, by, bz = frame_around(nx, ny, nz)
+    p, q = point(key_of(key_of(hits.stream[i], BRANCH + branch), DIFFUSE_WAY), number)
+    radius, turn = math.sqrt(p), 2.0 * math.pi * q
+    e, f, up = radius * math.cos(turn), radius * math.sin(turn), math.sqrt(1.0 - p)
+    dx, dy, dz = e * ax + f * bx + up * nx, e * ay + f * by + up * ny, e * az + f * bz + up * nz
+    if not _clear_of_face(hits, i, dx, dy, dz):
+        return 0
+    _send(rays, k, hits, i, dx, dy, dz, DIFFUSE, branch)
+    return 1
+
+
+@stage_kernel
+def split(materials, hits, start, stop, with_spike, lobe_rays, diffuse_rays, least, number, rays):
+    """Rays for all three parts of hits start..stop; returns how many. Those that carry no more than `least` stay."""
+    k = np.int64(0)
+    for i in range(start, stop):
+        if materials.shiny[hits.material[i]]:
+            if with_spike:
+                k += _send_spike(materials, hits, i, 1.0, least, rays, k, 0)
+            for j in range(lobe_rays):
+                k += _send_lobe(materials, hits, i, float(lobe_rays), least, number, rays, k, 1 + j)
+        for j in range(diffuse_rays):
+            k += _send_diffuse(materials, hits, i, float(diffuse_rays), least, number, rays, k, 1 + lobe_rays + j)
+    return k
+
+
+@stage_kernel
+def choose_one(materials, hits, start, stop, with_spike, with_lobe, with_diffuse, roulette, least, number, rays):
+    """At most one ray for each of hits start..stop, its part chosen by how much it reflects; returns how many.
+
+    With `roulette` a path goes on with the probability of what it carries, and then carries that much more: the mean stays."""
+    k = np.int64(0)
+    for i in range(start, stop):
+        material = hits.material[i]
+        cosine = -float(
+            hits.arriving[i, 0] * hits.shading[i, 0]
+            + hits.arriving[i, 1] * hits.shading[i, 1]
+            + hits.arriving[i, 2] * hits.shading[i, 2]
+        )
+        spike = lobe = diffuse = 0.0
+        for c in range(rays.weight.shape[1]):
+            carried = hits.weight[i, c]
+            if materials.shiny[material]:
+                if with_spike:
+                    spike = max(spike, carried * spike_of(materials, material, c, cosine))
+                if with_lobe:
+                    lobe = max(lobe, carried * lobe_guess(materials, material, c, cosine))
+            if with_diffuse:
+                diffuse = max(diffuse, carried * diffuse_of(materials, material, c))
+        total = spike + lobe + diffuse
+        if total <= least:
+            continue
+        choice, luck = point(key_of(hits.stream[i], CHOICE), number)
+        goes_on = min(1.0, total) if roulette else 1.0
+        if luck >= goes_on:
+            continue
+        choice *= total
+        if choice < spike:
+            k += _send_spike(materials, hits, i, goes_on * spike / total, 0.0, rays, k, 0)
+        elif choice < spike + lobe:
+            k += _send_lobe(materials, hits, i, goes_on * lobe / total, 0.0, number, rays, k, 0)
+        elif diffuse > 0.0:
+            k += _send_diffuse(materials, hits, i, goes_on * diffuse / total, 0.0, number, rays, k, 0)
+    return k

@@ -1,0 +1,51 @@
+"""What a picture is computed with. `plan` chooses these; `FULL` is the reference, `REPORT` the 1991 report's own approximations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from rangecheck.errors import SettingError
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How light is followed.
+
+    passes          samples of every pixel
+    centre          one sample in the pixel's middle instead of samples spread over it
+    shadow_rays     rays to each source per hit: 0 one to its middle, k > 0 over its solid angle
+    spike, lobe, diffuse  whether surfaces mirror, gather over the lobe, gather over the hemisphere (light from sources
+                    is always reflected by all three)
+    lobe_rays, diffuse_rays  rays of each hit that the camera sees; later hits send one ray for all
+    depth           reflections followed at most; 1 is light straight from the sources
+    least           paths that carry no more than this share are not followed (0: all are)
+    roulette_from   from this reflection on paths end by chance, without bias; 0: never
+    backdrop        the camera itself sees the surroundings; else it sees darkness there
+    """
+
+    passes: int = 1
+    centre: bool = False
+    shadow_rays: int = 1
+    spike: bool = True
+    lobe: bool = True
+    diffuse: bool = True
+    lobe_rays: int = 1
+    diffuse_rays: int = 1
+    depth: int = 16
+    least: float = 0.0
+    roulette_from: int = 3
+    backdrop: bool = True
+
+    def __post_init__(self) -> None:
+        for name, low, high in (("passes", 1, 1 << 20), ("shadow_rays", 0, 1024), ("depth", 1, 64), ("roulette_from", 0, 64)):
+            if not low <= getattr(self, name) <= high:
+                raise SettingError(f"{name} is {getattr(self, name)}; it must lie between {low} and {high}", key=name)
+        for name in ("lobe_rays", "diffuse_rays"):
+            if not 0 <= getattr(self, name) <= 4096:
+                raise SettingError(f"{name} is {getattr(self, name)}; it must lie between 0 and 4096", key=name)
+        if not 0 <= self.least < 1:
+            raise SettingError(f"least is {self.least}; it must be at least 0 and below 1", key="least")
+
+
+DIRECT = Settings(passes=1, centre=True, shadow_rays=0, spike=False, lobe=False, diffuse=False, depth=1)
+FULL = Settings(passes=64, shadow_rays=1, depth=64)
