@@ -64,25 +64,25 @@ def test_a_plane_under_one_source_is_its_closed_form():
 
 
 def test_a_ball_under_one_source_is_its_closed_form_also_where_the_horizon_cuts_the_source():
-    scene = Scene(ball(6), (WHITE,), sources=(lamp((120, 60, 90), 30.0),), smooth=True)
+    surface = ball(6)
+    scene = Scene(surface, (WHITE,), sources=(lamp((120, 60, 90), 30.0),), smooth=True, vertex_normals=surface.vertices / 50.0)
     camera, pose = looking(64, 64, fov=24.0)
     tracer = Tracer(scene)
     film = tracer.render(camera, pose, DIRECT)
     points, hits = seen_points(camera, pose, tracer.caster)
     points = np.where(np.isnan(points), [0.0, 0.0, 50.0], points)
     normals = points / np.linalg.norm(points, axis=1, keepdims=True)
+    # smooth faces are lit as the round surface that their normals describe
+    points = 50.0 * normals
     truth = light.lit_patch_radiance(points, normals, (120, 60, 90), 30.0, 10.0, 0.8)
-    # faces whose edges span up to 0.02 rad: normals interpolate to an eighth of its square; the sphere's radius departs as much,
-    # which moves the point that a slanting ray meets by several times that
-    facet = 0.02**2 / 8
     to_light = np.array([120.0, 60, 90]) - points
     cosine = (normals * to_light).sum(1) / np.linalg.norm(to_light, axis=1)
-    # the centre of the source decides about shadow: compare where it is above the horizon by more than a facet
+    # the middle of the source decides about shadow, so compare where it is above the horizon
     lit = (hits.face >= 0) & (cosine > 0.02)
-    assert lit.sum() > 800
-    assert (np.abs(film.radiance.ravel()[lit] - truth[lit]) <= (4 * facet / cosine[lit] + 1e-4) * truth[lit]).all()
-    bright = lit & (cosine > 0.5)
-    assert film.radiance.ravel()[bright] == pytest.approx(truth[bright], rel=1e-4)
+    assert lit.sum() > 1000
+    # near the horizon the skin of float32 that rays keep from the surface shows, as a share of the cosine
+    share = 1e-4 + tracer.caster.skin / cosine[lit]
+    assert (np.abs(film.radiance.ravel()[lit] - truth[lit]) <= share * truth[lit]).all()
 
 
 def test_two_sources_add_and_shadows_take_away():

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from rangecheck.arrays import FloatArray, IntArray
+from rangecheck.arrays import FloatArray, IntArray, require
 from rangecheck.errors import SceneError
 from rangecheck.reflectance import Material
 from rangecheck.scene.sources import Source
@@ -27,6 +27,7 @@ class Scene:
     surroundings     what shines from infinitely far away
     smooth           shade with normals interpolated between vertices instead of the faces' own
     smooth_of_part   the same, part by part, where given
+    vertex_normals   (n, 3) unit normals to shade with where smooth, if they are known better than the triangles tell
 
     Radiances hold one number, or one per wavelength of the materials. Raises SceneError when the numbers of wavelengths differ,
     a part lacks its material, or a source touches the surface."""
@@ -37,7 +38,8 @@ class Scene:
     sources: tuple[Source, ...] = ()
     surroundings: Surroundings = DARKNESS
     smooth: bool = False
-    smooth_of_part: tuple[bool, ...] = field(default=())
+    smooth_of_part: tuple[bool, ...] = ()
+    vertex_normals: FloatArray | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         parts = len(self.surface.part_names)
@@ -61,6 +63,9 @@ class Scene:
                 raise SceneError(
                     f"{name} has {count} radiances and the materials {self.channels} wavelengths; give 1 or {self.channels} radiances"
                 )
+        if self.vertex_normals is not None:
+            known = require("vertex_normals", self.vertex_normals, (len(self.surface.vertices), 3), finite=True)
+            object.__setattr__(self, "vertex_normals", known)
         for source in self.sources:
             self._keep_apart(source)
 
@@ -97,7 +102,8 @@ class Scene:
         smooth = self.smooth_of_part or (self.smooth,) * len(self.surface.part_names)
         chosen = np.asarray(smooth)[self.surface.part_of_face]
         if chosen.any():
-            rounded = self.surface.vertex_normals[self.surface.faces[chosen]]
+            known = self.surface.vertex_normals if self.vertex_normals is None else self.vertex_normals
+            rounded = known[self.surface.faces[chosen]]
             blank = (rounded == 0).all(axis=-1, keepdims=True)
             normals[chosen] = np.where(blank, normals[chosen], rounded)
         return normals
