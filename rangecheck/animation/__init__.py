@@ -1,6 +1,18 @@
 """Sequences of frames: the orbit they are seen from, and the files they become."""
 
+from rangecheck.animation.consistency import Consistency, faces_seen, measure_consistency, outline_of, verdict_for
 from rangecheck.animation.frames import pilot_indices, render_frames
 from rangecheck.animation.orbit import Orbit, framing_error_px, orbit_around
 
-__all__ = ["Orbit", "framing_error_px", "orbit_around", "pilot_indices", "render_frames"]
+__all__ = [
+    "Consistency",
+    "Orbit",
+    "faces_seen",
+    "framing_error_px",
+    "measure_consistency",
+    "orbit_around",
+    "outline_of",
+    "pilot_indices",
+    "render_frames",
+    "verdict_for",
+]
