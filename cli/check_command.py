@@ -7,12 +7,16 @@ from .common import common, settings_from
 
 @click.command("check", short_help="Check range scans or mesh files; verdict, findings with places, numbers.")
 @click.argument("files", nargs=-1, required=True, type=click.Path())
+@click.option("--opinions", is_flag=True, help="Ask trimesh, MeshLab and manifold3d too.")
+@click.option("--printer", metavar="NAME", help="Judge for printing by a profile of configs/printers, or a profile file.")
 @common("unit", "config", "set")
-def command(files, unit, config, assignments, reporter):
+def command(files, opinions, printer, unit, config, assignments, reporter):
     """Check range scans or mesh files; verdict, findings with places, numbers.
 
     Exit status 0: fit; 1: not fit; 2: not readable.
     """
     from rangecheck.pipeline import check
 
-    return check(files, settings=settings_from(config, assignments), unit=unit, reporter=reporter)
+    return check(
+        files, settings=settings_from(config, assignments), unit=unit, opinions=opinions, printer=printer, reporter=reporter
+    )

@@ -35,6 +35,7 @@ class Solidify(Section):
     relief_depth_mm: Positive = Field(20.0, description="how far behind its deepest point a relief from one view gets its back plane")
     base: Literal["auto", "none"] = Field("auto", description="auto cuts the bust flat where its lower end is ragged or invented")
     base_height_mm: float | None = Field(None, description="height of the base plane above the lowest point; overrides auto")
+    max_move_mm: Positive = Field(0.2, description="how far repair may move any point of the surface; what needs more is refused")
     height_mm: Positive | None = Field(None, description="scale the finished part to this height")
 
 

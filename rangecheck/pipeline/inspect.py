@@ -16,14 +16,24 @@ from rangecheck.pipeline.shape import findings_lines
 from rangecheck.pipeline.subject import holds_scans, read_all_scans
 from rangecheck.progress import Reporter
 from rangecheck.scan import RangeScan
-from rangecheck.solid import check_solid
 from rangecheck.solid.findings import catalogue
 from rangecheck.solid.findings import explain as explain_code
+from rangecheck.solid.opinions import Opinion
 
 
-def check(files: Sequence[str], *, settings: Settings, unit: str | None, reporter: Reporter) -> Outcome:
-    """Each file judged for what it is: scans by what they hold, meshes as the boundary of a solid."""
-    from rangecheck.surface.mesh_files import open_mesh
+def check(
+    files: Sequence[str],
+    *,
+    settings: Settings,
+    unit: str | None,
+    opinions: bool = False,
+    printer: str | None = None,
+    reporter: Reporter,
+) -> Outcome:
+    """Each file judged for what it is: scans by what they hold, meshes as the boundary of a solid, with `opinions` by other programs
+    too, and with `printer` (a profile) as something to be printed."""
+    from rangecheck.solid.check_file import check_mesh_file
+    from rangecheck.solid.printer import printer as printer_profile
 
     results: list[dict[str, Any]] = []
     lines: list[str] = []
@@ -42,16 +52,32 @@ def check(files: Sequence[str], *, settings: Settings, unit: str | None, reporte
                 for a in about
             ]
             continue
-        with reporter.stage("reading mesh"):
-            opened = open_mesh(path, unit)
         with reporter.stage("checking"):
-            verdict = check_solid(opened.surface, severities=settings.checking.severities)
-        results.append({"file": file, "kind": "mesh", "sha256": sha256(path), "notes": opened.notes, **verdict.to_dict()})
+            checked = check_mesh_file(
+                path,
+                unit,
+                opinions=opinions,
+                printer=printer_profile(printer) if printer else None,
+                severities=settings.checking.severities,
+            )
+        results.append(
+            {"file": file, "kind": "mesh", "sha256": sha256(path), "notes": checked.file.notes, **checked.verdict.to_dict()}
+        )
         lines.append(f"{file}:")
-        lines += [f"  {note}" for note in opened.notes]
-        lines += [f"  {line}" for line in findings_lines(verdict)]
+        lines += [f"  {note}" for note in checked.file.notes]
+        lines += [f"  {line}" for line in findings_lines(checked.verdict)]
+        lines += [f"  {_word_of(opinion)}" for opinion in checked.opinions]
     fit = all(result["fit"] for result in results)
     return Outcome(document("check", fit=fit, files=results, seconds=reporter.seconds), lines, fit)
+
+
+def _word_of(opinion: Opinion) -> str:
+    """One program's opinion in one line."""
+    said = {True: "closed", False: "not closed", None: "gave no answer"}[opinion.closed]
+    counted = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in opinion.facts.items())
+    return (
+        f"{opinion.program:<10} {said}" + (f" ({counted})" if counted else "") + (f": {opinion.error}" if opinion.error else "")
+    )
 
 
 def scan_facts(scan: RangeScan) -> dict[str, Any]:

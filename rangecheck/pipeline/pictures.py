@@ -26,11 +26,11 @@ from rangecheck.reflectance import Material, load_material
 from rangecheck.rigid import look_at
 from rangecheck.scene import Scene, studio
 from rangecheck.surface import Surface
+from rangecheck.transport import Film, Tracer
 from rangecheck.transport import Settings as LightSettings
-from rangecheck.transport import Tracer
 
-#: what a pixel looks like where no surface is seen: a little of the studio's backdrop
-BACKDROP = 0.0
+#: radiance behind the object, where white that faces the key light has 1: an even, dark backdrop, whatever the surroundings
+BACKDROP = 0.05
 
 
 def camera_of(settings: Settings) -> PinholeCamera:
@@ -75,7 +75,7 @@ def render_turntable(
         plan = plan_of(tracer, camera, orbit.world_from_camera(0), settings)
 
     def frame(index: int) -> FloatArray:
-        return tracer.render(camera, orbit.world_from_camera(index), plan.settings, seed=settings.seed + index).radiance
+        return before_backdrop(tracer.render(camera, orbit.world_from_camera(index), plan.settings, seed=settings.seed + index))
 
     key = {
         "version": __version__,
@@ -103,6 +103,11 @@ def render_turntable(
     return Rendered(material.name, frames, film, plan.explain(), 0.0)
 
 
+def before_backdrop(film: Film) -> FloatArray:
+    """(h, w, c) radiance of the film in front of the backdrop."""
+    return film.radiance + (BACKDROP * (1 - film.coverage))[..., None].astype(film.radiance.dtype)
+
+
 @dataclass(frozen=True)
 class LightPlan:
     settings: LightSettings
@@ -113,12 +118,11 @@ class LightPlan:
 
 
 def plan_of(tracer: Tracer, camera: PinholeCamera, pose: FloatArray, settings: Settings) -> LightPlan:
-    return LightPlan(LightSettings(passes=4, depth=3), [])
+    return LightPlan(LightSettings(passes=4, depth=3, backdrop=False), [])
 
 
 def _encode(radiance: FloatArray, exposure: float) -> bytes:
-    image = radiance[..., 0] if radiance.shape[2] == 1 else radiance
-    return png_bytes(develop(image, exposure, BACKDROP))
+    return png_bytes(develop(_grey_or_colour(radiance), exposure))
 
 
 def orbit_of(surface: Surface, settings: Settings) -> Orbit:
@@ -164,7 +168,7 @@ def render(
         plan = plan_of(tracer, camera, pose, settings)
         film = tracer.render(camera, pose, plan.settings, seed=settings.seed)
     exposure = exposure_from([film.radiance])
-    write_png(out, develop(_grey_or_colour(film.radiance), exposure, BACKDROP), force=force)
+    write_png(out, develop(_grey_or_colour(before_backdrop(film)), exposure), force=force)
     lines = [f"{out}: {camera.width}x{camera.height}, {material.name}, mean radiance {film.mean_radiance:.4g}", *plan.explain()]
     return Outcome(
         document("render", output=out, material=material.name, camera=camera.to_dict(), world_from_camera=pose, exposure=exposure,
@@ -218,11 +222,11 @@ def maps(
     nearest, farthest = float(np.nanmin(measured.distance_mm)), float(np.nanmax(measured.distance_mm))
     lines = [
         f"{out}: {len(written)} files; distances {nearest:.2f} to {farthest:.2f} mm over {int(measured.hit.sum()):,} pixels",
-        f"projected back, no point lies further than {proof.farthest_mm:.2g} mm from the surface (bound {proof.bound_mm:.2g} mm)",
+        f"projected back, no point lies further than {proof.distance_max_mm:.2g} mm from the surface (bound {proof.bound_mm:.2g} mm)",
     ]
     return Outcome(
         document("maps", files=written, nearest_mm=nearest, farthest_mm=farthest, pixels=int(measured.hit.sum()),
-                 back_projection={"farthest_mm": proof.farthest_mm, "bound_mm": proof.bound_mm, "holds": proof.holds},
+                 back_projection={"distance_max_mm": proof.distance_max_mm, "depth_max_mm": proof.depth_max_mm, "bound_mm": proof.bound_mm, "holds": proof.holds},
                  camera=camera.to_dict(), world_from_camera=pose, seconds=reporter.seconds),
         lines,
         proof.holds,

@@ -12,9 +12,7 @@ from rangecheck.pipeline.folder import check_free, check_writable
 from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.subject import eye_of, hashes, read_all_scans, read_subject, surface_of
 from rangecheck.progress import Reporter
-from rangecheck.solid import Solid, Verdict, check_solid
-from rangecheck.solid.base import choose_base_height, cut_flat
-from rangecheck.solid.relief import close_relief
+from rangecheck.solid import Solid, Verdict, check_solid, choose_base_height, close_relief, cut_flat, untangle
 from rangecheck.surface import ORIGIN_NAMES, Surface
 from rangecheck.surface.topology import boundary_edges, is_closed
 
@@ -54,7 +52,7 @@ def solid_of(
     try:
         with reporter.stage("closing"):
             if is_closed(surface):
-                made = Solid.from_surface(surface)
+                made = Solid.from_surface(_untangled(surface, wanted.max_move_mm, reporter))
             else:
                 made = close_relief(surface, back_mm=wanted.relief_depth_mm, eye_mm=eye_mm)
                 reporter.note("open surface closed as a relief: skirt and back plane along its outer loop")
@@ -66,6 +64,17 @@ def solid_of(
         found = refusal.measured.get("verdict")
         return None, found if isinstance(found, Verdict) else check_solid(surface)
     return made, made.verdict
+
+
+def _untangled(surface: Surface, max_move_mm: float, reporter: Reporter) -> Surface:
+    """The surface with small folds loosened, none of its points moved by more than the leash."""
+    result = untangle(surface, max_move_mm=max_move_mm)
+    if result.before:
+        reporter.note(
+            f"{result.before} pairs of faces ran through each other; {result.after} do after moving {result.vertices_moved} "
+            f"vertices by at most {result.moved_mm:.3f} mm (leash {max_move_mm:g} mm)"
+        )
+    return result.surface
 
 
 def _based(made: Solid, settings: Settings, reporter: Reporter) -> Solid:

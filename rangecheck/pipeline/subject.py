@@ -52,7 +52,8 @@ def surface_of(scans: list[RangeScan], settings: Settings, reporter: Reporter) -
     """One surface of all scans, the method that made it, and why that one."""
     from rangecheck.surface.meshing import choose_method, mesh_scans
 
-    method, reason = settings.meshing.method, "asked for"
+    method: str = settings.meshing.method
+    reason = "asked for"
     if method == "auto":
         method, reason = choose_method(scans)
     with reporter.stage("meshing"):
