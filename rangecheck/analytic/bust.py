@@ -19,6 +19,8 @@ from rangecheck.arrays import FloatArray, require, unit_vectors
 from rangecheck.kernels import in_chunks, kernel
 
 CHUNK = 16384
+#: how far `bust_distance_mm` searches where the slope does not lead to the surface
+SEARCH_MM = 20.0
 _LOW, _HIGH = np.array([-128.0, -8.0, -88.0]), np.array([128.0, 312.0, 100.0])
 _STEP = 4.0
 #: the table's safe distance starts where the function exceeds this; its slope there lies between 1/4 and 2
@@ -50,31 +52,91 @@ def _gradients(points, heights, out, start, end):
 
 
 @kernel
+def _onto(x, y, z, heights):
+    """A point of the surface near a point, along the slope there: x, y, z, whether it was reached."""
+    gx, gy, gz = gradient(x, y, z, heights)
+    square = max(gx * gx + gy * gy + gz * gz, 0.04)
+    value = bust_function(x, y, z, heights)
+    for _ in range(12):
+        if abs(value) < 1e-9:
+            return x, y, z, True
+        step = value / square
+        x, y, z = x - step * gx, y - step * gy, z - step * gz
+        value = bust_function(x, y, z, heights)
+    return x, y, z, abs(value) < 1e-7
+
+
+@kernel
+def _foot(px, py, pz, sx, sy, sz, heights):
+    """Distance from p to the surface, walking from the surface point s to the foot of the perpendicular; and whether it was found."""
+    best = math.sqrt((px - sx) ** 2 + (py - sy) ** 2 + (pz - sz) ** 2)
+    share = 1.0
+    for _ in range(40):
+        gx, gy, gz = gradient(sx, sy, sz, heights)
+        dx, dy, dz = px - sx, py - sy, pz - sz
+        along = (dx * gx + dy * gy + dz * gz) / max(gx * gx + gy * gy + gz * gz, 1e-12)
+        tx, ty, tz = dx - along * gx, dy - along * gy, dz - along * gz
+        if tx * tx + ty * ty + tz * tz < 1e-10:
+            return best, True
+        while True:
+            nx, ny, nz, reached = _onto(sx + share * tx, sy + share * ty, sz + share * tz, heights)
+            length = math.sqrt((px - nx) ** 2 + (py - ny) ** 2 + (pz - nz) ** 2)
+            if reached and length < best:
+                sx, sy, sz, best = nx, ny, nz, length
+                share = min(1.0, 2.0 * share)
+                break
+            share *= 0.5
+            if share < 1e-3:
+                # no nearer point along the tangent: rounding, or an edge
+                return best, tx * tx + ty * ty + tz * tz < 1e-6 * best * best + 1e-8
+    return best, False
+
+
+@kernel
+def _search(px, py, pz, reach, heights):
+    """Nearest crossing on 26 rays from p, within `reach`: its distance (inf if none) and place."""
+    side = bust_function(px, py, pz, heights)
+    best, bx, by, bz = np.inf, px, py, pz
+    for i in range(-1, 2):
+        for j in range(-1, 2):
+            for k in range(-1, 2):
+                length = math.sqrt(i * i + j * j + k * k)
+                if length == 0.0:
+                    continue
+                dx, dy, dz = i / length, j / length, k / length
+                limit = min(reach, best)
+                low = 0.0
+                for step in range(1, 13):
+                    high = limit * step / 12.0
+                    if bust_function(px + high * dx, py + high * dy, pz + high * dz, heights) * side <= 0.0:
+                        for _ in range(40):
+                            middle = 0.5 * (low + high)
+                            if bust_function(px + middle * dx, py + middle * dy, pz + middle * dz, heights) * side <= 0.0:
+                                high = middle
+                            else:
+                                low = middle
+                        best, bx, by, bz = high, px + high * dx, py + high * dy, pz + high * dz
+                        break
+                    low = high
+    return best, bx, by, bz
+
+
+@kernel
 def _feet(points, heights, out, start, end):
     for n in range(start, end):
         px, py, pz = points[n, 0], points[n, 1], points[n, 2]
         side = 1.0 if bust_function(px, py, pz, heights) >= 0.0 else -1.0
-        nearest = np.inf
-        sx, sy, sz = px, py, pz
-        for _ in range(12):
-            # onto the surface
-            gx, gy, gz = 0.0, 0.0, 1.0
-            for _ in range(8):
-                value = bust_function(sx, sy, sz, heights)
-                gx, gy, gz = gradient(sx, sy, sz, heights)
-                step = value / max(gx * gx + gy * gy + gz * gz, 0.04)
-                sx, sy, sz = sx - step * gx, sy - step * gy, sz - step * gz
-                if abs(value) < 1e-9:
-                    break
-            dx, dy, dz = px - sx, py - sy, pz - sz
-            length = math.sqrt(dx * dx + dy * dy + dz * dz)
-            nearest = min(nearest, length)
-            # along its tangent plane to the foot of the perpendicular on that plane
-            along = (dx * gx + dy * gy + dz * gz) / (gx * gx + gy * gy + gz * gz)
-            tx, ty, tz = dx - along * gx, dy - along * gy, dz - along * gz
-            if tx * tx + ty * ty + tz * tz < 1e-12:
-                break
-            sx, sy, sz = sx + tx, sy + ty, sz + tz
+        sx, sy, sz, found = _onto(px, py, pz, heights)
+        nearest, straight = np.inf, 0.0
+        if found:
+            straight = math.sqrt((px - sx) ** 2 + (py - sy) ** 2 + (pz - sz) ** 2)
+            nearest, found = _foot(px, py, pz, sx, sy, sz, heights)
+        # where the slope did not lead to the foot, other walls may be nearer
+        if not found or nearest < 0.999 * straight - 1e-6:
+            length, sx, sy, sz = _search(px, py, pz, min(nearest, SEARCH_MM), heights)
+            if length < nearest:
+                again, _ = _foot(px, py, pz, sx, sy, sz, heights)
+                nearest = min(nearest, again)
         out[n] = side * nearest
 
 
@@ -186,11 +248,11 @@ def bust_signed_distance(points_mm: FloatArray) -> FloatArray:
 
 
 def bust_distance_mm(points_mm: FloatArray) -> FloatArray:
-    """(n,) signed distance in mm, negative inside, of points (n, 3) within a few mm of the surface.
+    """(n,) signed distance in mm, negative inside, of points (n, 3) within a few mm of the surface; inf (-inf) beyond SEARCH_MM.
 
-    The foot of the perpendicular is sought from the root along the gradient, then along the tangent plane (Hartmann, *On the
-    curvature of curves and surfaces defined by normalforms*, 1999). Where the surface curves more sharply than the distance
-    there are several feet, and the nearest one found counts: never less than the true distance."""
+    The foot of the perpendicular is sought from the root along the gradient, then along tangent planes (Hartmann, *On the
+    curvature of curves and surfaces defined by normalforms*, 1999), and where that bends away, from the nearest crossing on 26
+    rays. Never less than the true distance."""
     points = require("points_mm", points_mm, (None, 3), finite=True)
     out = np.empty(len(points))
     heights = height_map()
