@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +68,10 @@ def frame_name(index: int, frames: int, suffix: str = ".png") -> str:
     return f"frame_{index:0{max(4, len(str(frames - 1)))}d}{suffix}"
 
 
+#: makes frames of the given numbers, wherever, and yields (number, radiance) as they are ready, in any order
+Spread = Callable[[Sequence[int]], Iterator[tuple[int, FloatArray]]]
+
+
 def render_frames(
     frame: Callable[[int], FloatArray],
     frames: int,
@@ -78,13 +83,14 @@ def render_frames(
     suffix: str = ".png",
     force: bool = False,
     progress: Callable[[int, int], None] | None = None,
+    spread: Spread | None = None,
 ) -> list[Path]:
     """Make frames 0..frames-1 as files in `folder`, or those of them that are missing, and return their paths in order.
 
     frame(index) is the radiance of one frame, a pure function of its number; encode(radiance, exposure) is its file. `exposure`
     is a number, or a function of the pilot frames' radiances, asked once before the first frame is written and then kept in the
     manifest. progress(done, frames) is called after each frame. An interruption leaves only whole files, and the next call with
-    the same key goes on to the same bytes.
+    the same key goes on to the same bytes. With `spread` (see `farm`) frames are made elsewhere, and `frame` is not called here.
 
     Raises OutputError when the folder holds frames of another job, or frames without a manifest, unless `force`, which removes
     them first."""
@@ -96,10 +102,11 @@ def render_frames(
     missing = [i for i, path in enumerate(paths) if not _finished(path, done.get(path.name))]
     if progress is not None:
         progress(frames - len(missing), frames)
+    made = spread if spread is not None else _one_after_the_other(frame)
     kept: dict[int, FloatArray] = {}
     if missing and manifest["exposure"] is None:
         if callable(exposure):
-            kept = {i: frame(i) for i in pilot_indices(frames)}
+            kept = dict(sorted(made(pilot_indices(frames))))
             manifest["exposure"] = float(exposure(list(kept.values())))
         else:
             manifest["exposure"] = float(exposure)
@@ -109,13 +116,15 @@ def render_frames(
         content = encode(radiance, level)
         write_bytes(paths[index], content)
         done[paths[index].name] = hashlib.sha256(content).hexdigest()
-        write_json(where / MANIFEST, manifest)
+        write_json(where / MANIFEST, manifest | {"done": dict(sorted(done.items()))})
 
+    ready = chain(
+        ((index, kept.pop(index)) for index in missing if index in kept), made([index for index in missing if index not in kept])
+    )
     # while one frame is traced the last one is encoded; one writer keeps the manifest in order
     with ThreadPoolExecutor(1, thread_name_prefix="frame-writer") as writer:
         writing: Future[None] | None = None
-        for count, index in enumerate(missing):
-            radiance = kept.pop(index) if index in kept else frame(index)
+        for count, (index, radiance) in enumerate(ready):
             if writing is not None:
                 writing.result()
                 if progress is not None:
@@ -126,6 +135,10 @@ def render_frames(
             if progress is not None:
                 progress(frames, frames)
     return paths
+
+
+def _one_after_the_other(frame: Callable[[int], FloatArray]) -> Spread:
+    return lambda indices: ((index, frame(index)) for index in indices)
 
 
 def _finished(path: Path, expected: str | None) -> bool:
