@@ -13,6 +13,7 @@ from rangecheck.scan.simulate import (
     FLYING,
     KINECT,
     MEASURED,
+    NOTHING_THERE,
     SATURATED,
     TOO_DARK,
     Finish,
@@ -130,6 +131,18 @@ def test_pixels_across_an_edge_fly_by_the_sum_of_phasors():
         1j * per_mm * far
     )
     assert made.scan.range_mm[row, 80] == pytest.approx(np.angle(total) / per_mm, abs=1.0)
+
+
+@pytest.mark.parametrize("kind", ["stripe", "gray-code", "time-of-flight"])
+def test_nothing_comes_back_from_where_nothing_is(kind):
+    finder = RangeFinder(kind=kind, ambient=0.5)
+    made = simulate_scan(plates((0.0, 40.0, 0.0)), CAMERA, POSE, finder, 1, with_brightness=True)
+    assert 1000 < made.scan.valid.sum() < 2000
+    empty = np.isnan(made.true_range_mm) & ~(made.reason == FLYING)
+    border = np.abs(CAMERA.pixel_rays()[1][..., :2] * 600).max(axis=-1) < 45
+    assert (made.scan.brightness[empty & ~border] == 0).all() and not made.scan.valid[empty & ~border].any()
+    away = simulate_scan(plates((0.0, 40.0, 5000.0)), CAMERA, POSE, finder, 1)
+    assert not away.scan.valid.any() and (away.reason == NOTHING_THERE).all()
 
 
 def test_flight_times_wrap():

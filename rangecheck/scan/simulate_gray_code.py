@@ -121,7 +121,9 @@ def simulate_gray_code(
     bundles = [camera_rays(pose, camera.rays(u + du, v + dv)) for dv in offsets for du in offsets]
     source = np.asarray(world_from_projector)[:3, 3]
 
-    def lit(bundle: tuple[FloatArray, FloatArray], time: float | None) -> tuple[FloatArray, ...]:
+    def lit(
+        bundle: tuple[FloatArray, FloatArray], time: float | None
+    ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         times = None if time is None else np.full(u.size, time)
         view = look(caster, *bundle, source, finish=finish, motion=motion, time_s=times)
         with np.errstate(invalid="ignore"):
@@ -131,10 +133,10 @@ def simulate_gray_code(
             inside = np.abs(uv + 0.5 - 0.5 * np.array([projector.width, projector.height])) <= 0.5 * np.array(
                 [projector.width, projector.height]
             )
-        reached = inside.all(axis=-1) & view.lit
-        signal = np.where(reached, view.signal(capture.working_distance_mm), 0.0)
+        reached = np.nonzero(inside.all(axis=-1) & view.lit)[0]
+        signal = view.signal(capture.working_distance_mm)[reached]
         ambient = np.where(view.seen, capture.ambient * finish.diffuse, 0.0)
-        return np.where(reached, uv[..., 0], np.nan), np.where(reached, uv[..., 1], np.nan), signal, ambient, view.distance_mm
+        return reached, uv[reached], signal, ambient, view.distance_mm
 
     still = [lit(bundle, None) for bundle in bundles] if motion is None else []
     counts = 2**capture.bits - 1
@@ -143,17 +145,20 @@ def simulate_gray_code(
         time = (index - 0.5 * (len(names) - 1)) * capture.interval_s
         light = np.zeros(u.size)
         for k, bundle in enumerate(bundles):
-            column, row, signal, ambient, _ = still[k] if motion is None else lit(bundle, time)
-            pattern = _read(columns[index], column) * _read(rows[index], row)
-            light += signal * (capture.leak + (1.0 - capture.leak) * pattern) + ambient
+            reached, uv, signal, ambient, _ = still[k] if motion is None else lit(bundle, time)
+            pattern = _read(columns[index], uv[:, 0]) * _read(rows[index], uv[:, 1])
+            light += ambient
+            light[reached] += signal * (capture.leak + (1.0 - capture.leak) * pattern)
         mean = capture.electrons * light / (len(bundles) * capture.full_scale)
         random = np.random.Generator(np.random.Philox(key=np.array([seed, camera_index * 65536 + index], dtype=np.uint64)))
         electrons = mean + np.sqrt(mean + capture.read_electrons**2) * random.standard_normal(u.size)
         pictures[index] = np.clip(np.rint(electrons / capture.electrons * counts), 0, counts).reshape(u.shape)
 
-    column, row, _, _, distance = lit(camera_rays(pose, camera.pixel_rays()), None if motion is None else 0.0)
+    reached, uv, _, _, distance = lit(camera_rays(pose, camera.pixel_rays()), None if motion is None else 0.0)
+    truth = np.full((2, u.size), np.nan)
+    truth[:, reached] = uv.T
     distance = np.where(np.isfinite(distance), distance, np.nan)
-    return GrayCodePictures(pictures, names, column.reshape(u.shape), row.reshape(u.shape), distance.reshape(u.shape))
+    return GrayCodePictures(pictures, names, truth[0].reshape(u.shape), truth[1].reshape(u.shape), distance.reshape(u.shape))
 
 
 def _blurred(values: IntArray, blur_px: float) -> FloatArray:
@@ -167,6 +172,8 @@ def _blurred(values: IntArray, blur_px: float) -> FloatArray:
 
 
 def _read(profile: FloatArray, coordinate: FloatArray) -> FloatArray:
-    """Values of a blurred pattern at projector coordinates, 0 where NaN."""
-    place = (np.where(np.isnan(coordinate), 0.0, coordinate) + 0.5) * _FINE - 0.5
-    return np.where(np.isnan(coordinate), 0.0, np.interp(place, np.arange(len(profile)), profile))
+    """Values of a blurred pattern at projector coordinates within it."""
+    place = np.clip((coordinate + 0.5) * _FINE - 0.5, 0.0, len(profile) - 1.0)
+    left = np.minimum(place.astype(int), len(profile) - 2)
+    share = place - left
+    return (1.0 - share) * profile[left] + share * profile[left + 1]

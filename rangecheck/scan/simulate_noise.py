@@ -40,5 +40,5 @@ def kinect_noise(depth_mm: FloatArray, theta_rad: FloatArray) -> FloatArray:
 def photon_noise(noise_mm: float, signal: FloatArray, ambient: float) -> FloatArray:
     """noise_mm sqrt(A + B) / A: shot noise of a demodulated signal A under constant light B (Lange & Seitz, *Solid-state time-of-flight
     range camera*, IEEE J. Quantum Electronics 37(3), 2001), noise_mm being that of A = 1, B = 0."""
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):
         return noise_mm * np.sqrt(signal + ambient) / signal

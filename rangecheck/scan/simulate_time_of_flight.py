@@ -92,4 +92,5 @@ def footprint_mm(camera: Camera, range_mm: FloatArray) -> FloatArray:
 
 def range_of_path(path_mm: FloatArray, source_along_ray_mm: FloatArray, source_squared_mm2: float) -> FloatArray:
     """Range r from the length of the way source - surface - camera: |r d - s| = path - r squared and solved for r."""
-    return (path_mm**2 - source_squared_mm2) / (2.0 * (path_mm - source_along_ray_mm))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return (path_mm**2 - source_squared_mm2) / (2.0 * (path_mm - source_along_ray_mm))

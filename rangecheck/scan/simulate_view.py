@@ -142,16 +142,33 @@ def look(
         origins_mm, source = motion.back(origins_mm, time_s), motion.back(source, time_s)
         rays = motion.turn_back(rays, time_s)
     distance, normals = _first_surface(caster, np.ascontiguousarray(origins_mm), np.ascontiguousarray(rays))
-    seen = np.isfinite(distance)
-    points = np.where(seen[:, None], origins_mm + np.where(seen, distance, 0.0)[:, None] * rays, np.nan)
-    reach = np.linalg.norm(source - points, axis=1)
-    to_source = (source - points) / reach[:, None]
-    cos_source = (normals * to_source).sum(axis=1)
-    lit = seen & (cos_source > 0)
-    lit[lit] = ~_blocked(caster, points[lit], normals[lit], source[lit])
-    response = np.full(len(rays), np.nan)
-    response[seen] = finish.response(normals[seen], to_source[seen], -rays[seen])
-    return View(distance, points, normals, -(normals * rays).sum(axis=1), cos_source, reach, lit, response)
+    n, seen = len(rays), np.isfinite(distance)
+    hit = np.nonzero(seen)[0]
+    here = origins_mm[hit] + distance[hit, None] * rays[hit]
+    reach = np.linalg.norm(source[hit] - here, axis=1)
+    to_source = (source[hit] - here) / reach[:, None]
+    facing = (normals[hit] * to_source).sum(axis=1)
+    reached = facing > 0
+    if not np.array_equal(source[hit], origins_mm[hit]):
+        reached[reached] = ~_blocked(caster, here[reached], normals[hit][reached], source[hit][reached])
+    lit = np.zeros(n, bool)
+    lit[hit] = reached
+
+    def spread(values: FloatArray) -> FloatArray:
+        full = np.full((n, *values.shape[1:]), np.nan)
+        full[hit] = values
+        return full
+
+    return View(
+        distance,
+        spread(here),
+        normals,
+        spread(-(normals[hit] * rays[hit]).sum(axis=1)),
+        spread(facing),
+        spread(reach),
+        lit,
+        spread(finish.response(normals[hit], to_source, -rays[hit])),
+    )
 
 
 def camera_rays(pose: FloatArray, local: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
