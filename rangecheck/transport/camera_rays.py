@@ -67,23 +67,27 @@ class PictureRays:
 
 
 @stage_kernel
-def start_rays(pixels, width, centre, seed, number, places, rays):
-    """Pixel coordinates places (2, n) of sample `number` of each pixel, and rays that carry all the light that they find."""
-    channels = rays.weight.shape[1]
+def start_rays(pixels, width, each, centre, seed, number, places, rays):
+    """Pixel coordinates places (2, n each) of group `number` of `each` samples of every pixel, and rays that together carry all the
+    light that they find. The samples of one group are spread evenly over the pixel; `centre` puts a single one in its middle."""
+    k = np.int64(0)
     for i in range(len(pixels)):
         pixel = pixels[i]
         row = pixel // width
-        places[0, i], places[1, i] = pixel - row * width, row
         stream = stream_of(seed, pixel)
-        if not centre:
-            x, y = point(key_of(stream, PIXEL), number)
-            places[0, i] += x - 0.5
-            places[1, i] += y - 0.5
-        rays.far[i] = math.inf
-        rays.pixel[i], rays.stream[i] = i, stream
-        rays.kind[i] = rays.first[i] = CAMERA
-        for c in range(channels):
-            rays.weight[i, c] = 1.0
+        for j in range(each):
+            places[0, k], places[1, k] = pixel - row * width, row
+            if not centre:
+                x, y = point(key_of(stream, PIXEL), number * each + j)
+                places[0, k] += x - 0.5
+                places[1, k] += y - 0.5
+            rays.far[k] = math.inf
+            rays.pixel[k] = i
+            rays.stream[k], rays.number[k] = stream, number * each + j
+            rays.kind[k] = rays.first[k] = CAMERA
+            for c in range(rays.weight.shape[1]):
+                rays.weight[k, c] = 1.0 / each
+            k += 1
 
 
 @inline_kernel

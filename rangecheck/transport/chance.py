@@ -11,7 +11,7 @@ import numpy as np
 
 from rangecheck.kernels import stage_kernel
 
-#: what a key is for; a branch of a path is BRANCH plus its number, a source SHADOW plus its number
+#: what a key is for; a path's branch is BRANCH plus its kind, a source SHADOW plus its number
 PIXEL, LOBE_WAY, DIFFUSE_WAY, CHOICE, ORDER, SHADOW, BRANCH = 1, 2, 3, 4, 5, 1 << 16, 1 << 24
 
 _TO_UNIT = 1.0 / 4294967296.0

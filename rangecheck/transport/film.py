@@ -20,9 +20,9 @@ class Film:
 
     radiance  (h, w, c) float32, as of the scene's sources
     coverage  (h, w) float32, share of the pixel's samples that met a surface
-    variance  (h, w, c) float32 of `radiance`, estimated from the samples' own spread as if they were independent (they are
-              spread evenly, so that it is an upper estimate); NaN where a single sample was taken
-    samples   (h, w) int32 samples per pixel
+    variance  (h, w, c) float32 of `radiance`, estimated from the spread of the pixel's observations as if they were independent
+              (they are spread evenly, so that it is an upper estimate); NaN where a single one was made
+    samples   (h, w) int32 rays per pixel
     budget    (first reflection, number of reflections, light): radiance summed over samples and wavelengths, divided by pixels x passes
     lights    names of the lights, the surroundings last
     """
@@ -83,11 +83,11 @@ class Plate:
         n = height * width
         self.mean = np.zeros((n, channels), np.float32)
         self.spread = np.zeros((n, channels), np.float32)
-        self.covered = np.zeros(n, np.int32)
+        self.covered = np.zeros(n, np.float32)
         self.count = np.zeros(n, np.int32)
 
-    def develop(self, budget: FloatArray, lights: tuple[str, ...]) -> Film:
-        """The film."""
+    def develop(self, budget: FloatArray, lights: tuple[str, ...], rays: IntArray | None = None) -> Film:
+        """The film; `rays` per pixel where they differ from the observations."""
         count = self.count[:, None].astype(np.float32)
         with np.errstate(invalid="ignore", divide="ignore"):
             variance = np.where(count > 1, self.spread / (count * (count - 1)), np.float32(np.nan)).astype(np.float32)
@@ -96,19 +96,22 @@ class Plate:
             radiance=self.mean.reshape(*self.shape, -1),
             coverage=coverage.reshape(self.shape),
             variance=variance.reshape(*self.shape, -1),
-            samples=self.count.reshape(self.shape),
+            samples=(self.count if rays is None else rays).reshape(self.shape),
             budget=budget,
             lights=lights,
         )
 
 
 @stage_kernel
-def expose(pixels, sample, face, mean, spread, covered, count):
-    """Add one sample of each pixel; `face` says whether its ray met a surface."""
+def expose(pixels, each, sample, face, mean, spread, covered, count):
+    """Add one observation of each pixel, the mean of `each` rays; `face` says whether a ray met a surface."""
     for i in range(len(pixels)):
         pixel = pixels[i]
         count[pixel] += 1
-        covered[pixel] += face[i] >= 0
+        met = np.int64(0)
+        for j in range(each):
+            met += face[i * each + j] >= 0
+        covered[pixel] += np.float32(met / each)
         for c in range(sample.shape[1]):
             before = sample[i, c] - mean[pixel, c]
             mean[pixel, c] += before / count[pixel]

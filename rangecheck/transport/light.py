@@ -49,7 +49,7 @@ def _put_gain(shadows, k, hits, i, materials, sources, source, dx, dy, dz, cosin
 
 
 @stage_kernel
-def aim(sources, materials, hits, start, stop, rays_per_source, number, with_diffuse, with_lobe, shadows):
+def aim(sources, materials, hits, start, stop, rays_per_source, with_diffuse, with_lobe, shadows):
     """Shadow rays from hits start..stop to all sources; returns how many. Source by source, so that neighbours stay neighbours."""
     k = np.int64(0)
     for s in range(len(sources.radius)):
@@ -76,14 +76,14 @@ def aim(sources, materials, hits, start, stop, rays_per_source, number, with_dif
                     k += 1
                 continue
             k = _aim_soft(
-                sources, materials, hits, i, s, x, y, z, distance, rays_per_source, number, diffuse_light, shines, shadows, k
+                sources, materials, hits, i, s, x, y, z, distance, rays_per_source, diffuse_light, shines, shadows, k
             )  # fmt: skip
     return k
 
 
 @stage_kernel
 def _aim_soft(
-    sources, materials, hits, i, s, x, y, z, distance, rays, number, diffuse_light, shines, shadows, k
+    sources, materials, hits, i, s, x, y, z, distance, rays, diffuse_light, shines, shadows, k
 ):  # fmt: skip
     """Rays spread evenly over the solid angle of source s; together they carry exactly the unshadowed diffuse irradiance."""
     nx, ny, nz = float(hits.shading[i, 0]), float(hits.shading[i, 1]), float(hits.shading[i, 2])
@@ -95,7 +95,7 @@ def _aim_soft(
     key = key_of(hits.stream[i], SHADOW + s)
     first, cosines = k, 0.0
     for j in range(rays):
-        p, q = point(key, number * rays + j)
+        p, q = point(key, hits.number[i] * rays + j)
         along = 1.0 - p * depth
         aside = math.sqrt(max(0.0, 1.0 - along * along))
         turn = 2.0 * math.pi * q

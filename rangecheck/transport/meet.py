@@ -44,8 +44,8 @@ def meet(geometry, sources, surroundings, rays, n, reflections, backdrop, gather
     corners, normals, materials, skin = geometry
     centre, radius, radiance = sources
     sky, frame, period, softness, low, high, picture, boxes, glow = surroundings
-    origin, direction, far, faces, us, vs, weight, pixels, kinds, firsts, streams = rays
-    place, shading, facing, arriving, hit_weight, hit_pixel, hit_first, hit_material, hit_stream = hits
+    origin, direction, far, faces, us, vs, weight, pixels, kinds, firsts, streams, numbers = rays
+    place, shading, facing, arriving, hit_weight, hit_pixel, hit_first, hit_material, hit_stream, hit_number = hits
     count = np.int64(0)
     channels = sample.shape[1]
     for i in range(n):
@@ -73,6 +73,6 @@ def meet(geometry, sources, surroundings, rays, n, reflections, backdrop, gather
         for c in range(channels):
             hit_weight[count, c] = weight[i, c]
         hit_pixel[count], hit_first[count], hit_stream[count] = pixel, firsts[i], streams[i]
-        hit_material[count] = materials[face]
+        hit_material[count], hit_number[count] = materials[face], numbers[i]
         count += 1
     return count

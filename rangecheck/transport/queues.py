@@ -20,7 +20,8 @@ KIND_NAMES = ("seen directly", "spike", "lobe", "diffuse")
 class Rays(NamedTuple):
     """origin, direction (n, 3); far, u, v (n,); face (n,) int32; weight (n, c): what reaches the pixel of the radiance that is
     found; pixel (n,); kind (n,) uint8: the reflection it leaves, whose light it looks for; first (n,) uint8: the first
-    reflection of its path; stream (n,) uint32: its chance."""
+    reflection of its path; stream, number (n,) uint32: which sequence of chance
+    serves it, and at which place."""
 
     origin: FloatArray
     direction: FloatArray
@@ -33,11 +34,12 @@ class Rays(NamedTuple):
     kind: IntArray
     first: IntArray
     stream: IntArray
+    number: IntArray
 
 
 class Hits(NamedTuple):
     """place, shading, facing, arriving (n, 3): point a skin off its face, shading normal, the face's normal, direction of the
-    ray that came; weight (n, c); pixel (n,); first (n,); material (n,) int16; stream (n,)."""
+    ray that came; weight (n, c); pixel (n,); first (n,); material (n,) int16; stream, number (n,)."""
 
     place: FloatArray
     shading: FloatArray
@@ -48,6 +50,7 @@ class Hits(NamedTuple):
     first: IntArray
     material: IntArray
     stream: IntArray
+    number: IntArray
 
 
 class Shadows(NamedTuple):
@@ -74,7 +77,7 @@ def new_rays(n: int, channels: int) -> Rays:
     return Rays(
         _floats(n, 3), _floats(n, 3), _floats(n), np.empty(n, np.int32), _floats(n), _floats(n),
         _floats(n, channels), np.empty(n, np.int32), np.empty(n, np.uint8), np.empty(n, np.uint8),
-        np.empty(n, np.uint32),
+        np.empty(n, np.uint32), np.empty(n, np.uint32),
     )  # fmt: skip
 
 
@@ -83,7 +86,7 @@ def new_hits(n: int, channels: int) -> Hits:
     return Hits(
         _floats(n, 3), _floats(n, 3), _floats(n, 3), _floats(n, 3),
         _floats(n, channels), np.empty(n, np.int32), np.empty(n, np.uint8), np.empty(n, np.int16),
-        np.empty(n, np.uint32),
+        np.empty(n, np.uint32), np.empty(n, np.uint32),
     )  # fmt: skip
 
 

@@ -42,7 +42,7 @@ def mirror_ray(hits, i):
 
 
 @stage_kernel
-def _send(rays, k, hits, i, dx, dy, dz, kind, branch):
+def _send(rays, k, hits, i, dx, dy, dz, kind, number):
     """Ray k leaves hit i; its weight is already written."""
     for axis in range(3):
         rays.origin[k, axis] = hits.place[i, axis]
@@ -50,7 +50,7 @@ def _send(rays, k, hits, i, dx, dy, dz, kind, branch):
     rays.far[k] = math.inf
     rays.pixel[k], rays.kind[k] = hits.pixel[i], kind
     rays.first[k] = kind if hits.first[i] == CAMERA else hits.first[i]
-    rays.stream[k] = key_of(hits.stream[i], BRANCH + branch)
+    rays.stream[k], rays.number[k] = key_of(hits.stream[i], BRANCH + kind), number
 
 
 @stage_kernel
@@ -59,7 +59,7 @@ def _clear_of_face(hits, i, dx, dy, dz):
 
 
 @stage_kernel
-def _send_spike(materials, hits, i, share, least, rays, k, branch):
+def _send_spike(materials, hits, i, share, least, rays, k):
     """The mirror ray, equation (34), unless it carries no more than `least`; returns the number of rays sent."""
     cosine = -(
         hits.arriving[i, 0] * hits.shading[i, 0]
@@ -74,18 +74,18 @@ def _send_spike(materials, hits, i, share, least, rays, k, branch):
     if most <= least:
         return 0
     x, y, z = mirror_ray(hits, i)
-    _send(rays, k, hits, i, x, y, z, SPIKE, branch)
+    _send(rays, k, hits, i, x, y, z, SPIKE, hits.number[i])
     return 1
 
 
 @stage_kernel
-def _send_lobe(materials, hits, i, share, least, number, rays, k, branch):
+def _send_lobe(materials, hits, i, share, least, number, rays, k):
     """One ray drawn by scattering order; `share` of such rays make the estimate."""
     material = hits.material[i]
     nx, ny, nz = float(hits.shading[i, 0]), float(hits.shading[i, 1]), float(hits.shading[i, 2])
     vx, vy, vz = -float(hits.arriving[i, 0]), -float(hits.arriving[i, 1]), -float(hits.arriving[i, 2])
     cosine = vx * nx + vy * ny + vz * nz
-    p, q, r, density = draw_lobe(materials, material, cosine, key_of(hits.stream[i], BRANCH + branch), number)
+    p, q, r, density = draw_lobe(materials, material, cosine, key_of(hits.stream[i], BRANCH + LOBE), number)
     if r <= 0.0:
         return 0
     # the frame's x axis is the viewer's tangential part; where there is none, any will do
@@ -107,12 +107,12 @@ def _send_lobe(materials, hits, i, share, least, number, rays, k, branch):
         most = max(most, weight)
     if not most > least:
         return 0
-    _send(rays, k, hits, i, dx, dy, dz, LOBE, branch)
+    _send(rays, k, hits, i, dx, dy, dz, LOBE, number)
     return 1
 
 
 @stage_kernel
-def _send_diffuse(materials, hits, i, share, least, number, rays, k, branch):
+def _send_diffuse(materials, hits, i, share, least, number, rays, k):
     """One ray of the hemisphere, drawn by its cosine."""
     material = hits.material[i]
     most = 0.0
@@ -124,33 +124,33 @@ def _send_diffuse(materials, hits, i, share, least, number, rays, k, branch):
         return 0
     nx, ny, nz = float(hits.shading[i, 0]), float(hits.shading[i, 1]), float(hits.shading[i, 2])
     ax, ay, az, bx, by, bz = frame_around(nx, ny, nz)
-    p, q = point(key_of(key_of(hits.stream[i], BRANCH + branch), DIFFUSE_WAY), number)
+    p, q = point(key_of(key_of(hits.stream[i], BRANCH + DIFFUSE), DIFFUSE_WAY), number)
     radius, turn = math.sqrt(p), 2.0 * math.pi * q
     e, f, up = radius * math.cos(turn), radius * math.sin(turn), math.sqrt(1.0 - p)
     dx, dy, dz = e * ax + f * bx + up * nx, e * ay + f * by + up * ny, e * az + f * bz + up * nz
     if not _clear_of_face(hits, i, dx, dy, dz):
         return 0
-    _send(rays, k, hits, i, dx, dy, dz, DIFFUSE, branch)
+    _send(rays, k, hits, i, dx, dy, dz, DIFFUSE, number)
     return 1
 
 
 @stage_kernel
-def split(materials, hits, start, stop, with_spike, lobe_rays, diffuse_rays, least, number, rays):
+def split(materials, hits, start, stop, with_spike, lobe_rays, diffuse_rays, least, rays):
     """Rays for all three parts of hits start..stop; returns how many. Those that carry no more than `least` stay."""
     k = np.int64(0)
     for i in range(start, stop):
         if materials.shiny[hits.material[i]]:
             if with_spike:
-                k += _send_spike(materials, hits, i, 1.0, least, rays, k, 0)
+                k += _send_spike(materials, hits, i, 1.0, least, rays, k)
             for j in range(lobe_rays):
-                k += _send_lobe(materials, hits, i, float(lobe_rays), least, number, rays, k, 1 + j)
+                k += _send_lobe(materials, hits, i, float(lobe_rays), least, hits.number[i] * lobe_rays + j, rays, k)
         for j in range(diffuse_rays):
-            k += _send_diffuse(materials, hits, i, float(diffuse_rays), least, number, rays, k, 1 + lobe_rays + j)
+            k += _send_diffuse(materials, hits, i, float(diffuse_rays), least, hits.number[i] * diffuse_rays + j, rays, k)
     return k
 
 
 @stage_kernel
-def choose_one(materials, hits, start, stop, with_spike, with_lobe, with_diffuse, roulette, least, number, rays):
+def choose_one(materials, hits, start, stop, with_spike, with_lobe, with_diffuse, roulette, least, rays):
     """At most one ray for each of hits start..stop, its part chosen by how much it reflects; returns how many.
 
     With `roulette` a path goes on with the probability of what it carries, and then carries that much more: the mean stays."""
@@ -175,15 +175,15 @@ def choose_one(materials, hits, start, stop, with_spike, with_lobe, with_diffuse
         total = spike + lobe + diffuse
         if total <= least:
             continue
-        choice, luck = point(key_of(hits.stream[i], CHOICE), number)
+        choice, luck = point(key_of(hits.stream[i], CHOICE), hits.number[i])
         goes_on = min(1.0, total) if roulette else 1.0
         if luck >= goes_on:
             continue
         choice *= total
         if choice < spike:
-            k += _send_spike(materials, hits, i, goes_on * spike / total, 0.0, rays, k, 0)
+            k += _send_spike(materials, hits, i, goes_on * spike / total, 0.0, rays, k)
         elif choice < spike + lobe:
-            k += _send_lobe(materials, hits, i, goes_on * lobe / total, 0.0, number, rays, k, 0)
+            k += _send_lobe(materials, hits, i, goes_on * lobe / total, 0.0, hits.number[i], rays, k)
         elif diffuse > 0.0:
-            k += _send_diffuse(materials, hits, i, goes_on * diffuse / total, 0.0, number, rays, k, 0)
+            k += _send_diffuse(materials, hits, i, goes_on * diffuse / total, 0.0, hits.number[i], rays, k)
     return k

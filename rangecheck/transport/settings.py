@@ -11,8 +11,9 @@ from rangecheck.errors import SettingError
 class Settings:
     """How light is followed.
 
-    passes          samples of every pixel
-    centre          one sample in the pixel's middle instead of samples spread over it
+    passes          observations of every pixel
+    each            rays per observation, spread evenly over the pixel
+    centre          rays through the pixel's middle instead
     shadow_rays     rays to each source per hit: 0 one to its middle, k > 0 over its solid angle
     spike, lobe, diffuse  whether surfaces mirror, gather over the lobe, gather over the hemisphere (light from sources
                     is always reflected by all three)
@@ -24,6 +25,7 @@ class Settings:
     """
 
     passes: int = 1
+    each: int = 1
     centre: bool = False
     shadow_rays: int = 1
     spike: bool = True
@@ -37,7 +39,13 @@ class Settings:
     backdrop: bool = True
 
     def __post_init__(self) -> None:
-        for name, low, high in (("passes", 1, 1 << 20), ("shadow_rays", 0, 1024), ("depth", 1, 64), ("roulette_from", 0, 64)):
+        for name, low, high in (
+            ("passes", 1, 1 << 20),
+            ("each", 1, 1024),
+            ("shadow_rays", 0, 1024),
+            ("depth", 1, 64),
+            ("roulette_from", 0, 64),
+        ):
             if not low <= getattr(self, name) <= high:
                 raise SettingError(f"{name} is {getattr(self, name)}; it must lie between {low} and {high}", key=name)
         for name in ("lobe_rays", "diffuse_rays"):

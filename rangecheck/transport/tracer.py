@@ -58,7 +58,8 @@ class Tracer:
         tally = np.zeros((len(KIND_NAMES), settings.depth + 1, len(self.lights)))
         for number in range(settings.passes):
             tally += self.expose(picture, pixels, settings, number, seed, plate)
-        return plate.develop(tally / (settings.passes * len(pixels)), self.lights)
+        rays = plate.count * np.int32(settings.each)
+        return plate.develop(tally / (settings.passes * len(pixels)), self.lights, rays)
 
     def picture_rays(self, camera: Camera, world_from_camera: FloatArray) -> PictureRays:
         """The rays of a camera at a pose, in this tracer's frame."""
@@ -74,7 +75,7 @@ class Tracer:
             with self._workspace() as work:
                 return _Chunk(self, settings, number, work).expose(picture, pixels[start:stop], seed, plate)
 
-        return np.sum(in_chunks(chunk, len(pixels), CHUNK), axis=0)
+        return np.sum(in_chunks(chunk, len(pixels), max(1, CHUNK // settings.each)), axis=0)
 
     @contextmanager
     def _workspace(self) -> Iterator[Workspace]:
@@ -95,13 +96,14 @@ class _Chunk:
         self._sample = work.samples(0)
 
     def expose(self, picture: PictureRays, pixels: IntArray, seed: int, plate: Plate) -> FloatArray:
-        n = len(pixels)
+        each, centre = self._settings.each, self._settings.centre
+        n = len(pixels) * each
         rays, places = self._work.rays(0, n), self._work.pixel_places(n)
-        self._sample = self._work.samples(n)
-        start_rays(pixels, picture.camera.width, self._settings.centre, seed & 0xFFFFFFFF, self._number, places, rays)
+        self._sample = self._work.samples(len(pixels))
+        start_rays(pixels, picture.camera.width, each, centre, seed & 0xFFFFFFFF, self._number, places, rays)
         picture.fill(places[0], places[1], rays.origin, rays.direction)
         self._follow(rays, n, 0)
-        expose(pixels, self._sample, rays.face, plate.mean, plate.spread, plate.covered, plate.count)
+        expose(pixels, each, self._sample, rays.face, plate.mean, plate.spread, plate.covered, plate.count)
         return self._tally
 
     def _follow(self, rays: Rays, n: int, reflections: int) -> None:
@@ -137,7 +139,7 @@ class _Chunk:
         for start in range(0, count, step):
             stop = min(start + step, count)
             shadows = self._work.shadows((stop - start) * each)
-            k = aim(tracer.sources, tracer.materials, hits, start, stop, settings.shadow_rays, self._number, True, True, shadows)
+            k = aim(tracer.sources, tracer.materials, hits, start, stop, settings.shadow_rays, True, True, shadows)
             if k:
                 tracer.caster.occluded_local(
                     shadows.origin[:k], shadows.direction[:k], shadows.far[:k], shadows.blocked[:k], coherent=reflections == 1
@@ -156,10 +158,9 @@ class _Chunk:
         if reflections == 0:
             return split(
                 tracer.materials, hits, start, stop, settings.spike, settings.lobe * settings.lobe_rays,
-                settings.diffuse * settings.diffuse_rays, settings.least, self._number, rays,
+                settings.diffuse * settings.diffuse_rays, settings.least, rays,
             )  # fmt: skip
         roulette = 0 < settings.roulette_from <= reflections
         return choose_one(
-            tracer.materials, hits, start, stop, settings.spike, settings.lobe, settings.diffuse, roulette, settings.least,
-            self._number, rays,
+            tracer.materials, hits, start, stop, settings.spike, settings.lobe, settings.diffuse, roulette, settings.least, rays,
         )  # fmt: skip
