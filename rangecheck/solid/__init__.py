@@ -3,11 +3,13 @@
 from rangecheck.solid.base import choose_base_height, cut_flat
 from rangecheck.solid.findings import Finding, Verdict, explain, finding, verdict
 from rangecheck.solid.relief import close_relief
+from rangecheck.solid.repair import Repaired, repair
 from rangecheck.solid.solid import Solid, check_solid
 from rangecheck.solid.untangle import untangle
 
 __all__ = [
     "Finding",
+    "Repaired",
     "Solid",
     "Verdict",
     "check_solid",
@@ -16,6 +18,7 @@ __all__ = [
     "cut_flat",
     "explain",
     "finding",
+    "repair",
     "untangle",
     "verdict",
 ]

@@ -33,12 +33,6 @@ def _faces_with(surface: Surface, vertices: IntArray) -> IntArray:
     return np.flatnonzero(mark[surface.faces].any(axis=1))
 
 
-def _faces_at(surface: Surface, edges_wanted: Any) -> IntArray:
-    """Faces at the edges that a mask over the edge table selects."""
-    table = topo.edge_table(surface)
-    return np.unique(table.halves[np.repeat(edges_wanted, table.uses)] // 3)
-
-
 def rims(surface: Surface, severities: Severities = None) -> list[Finding]:
     """Open edges, by loop with length and size."""
     edges = topo.boundary_edges(surface)
@@ -54,7 +48,7 @@ def rims(surface: Surface, severities: Severities = None) -> list[Finding]:
             len(edges),
             f"surface is open: {len(edges)} boundary edges in {len(loops)} loops, the longest {lengths[longest]:.1f} mm",
             np.array([surface.vertices[r].mean(axis=0) for r in loops]),
-            _faces_at(surface, topo.edge_table(surface).uses == 1),
+            topo.faces_at_edges(surface, topo.edge_table(surface).uses == 1),
             severities,
             loops=[
                 {"edges": len(r), "length_mm": round(float(n), 4), "size_mm": [round(float(x), 4) for x in s]}
@@ -77,7 +71,7 @@ def manifoldness(surface: Surface, severities: Severities = None) -> list[Findin
                 len(edges),
                 message,
                 _edge_middles(surface, edges),
-                _faces_at(surface, table.uses > 2),
+                topo.faces_at_edges(surface, table.uses > 2),
                 severities,
             )
         )
@@ -103,7 +97,7 @@ def manifoldness(surface: Surface, severities: Severities = None) -> list[Findin
                 int(turned.sum()),
                 message,
                 _edge_middles(surface, table.ends[turned]),
-                _faces_at(surface, turned),
+                topo.faces_at_edges(surface, turned),
                 severities,
             )
         )

@@ -14,7 +14,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from rangecheck.arrays import FloatArray, IntArray
+from rangecheck.arrays import BoolArray, FloatArray, IntArray
 from rangecheck.kernels import kernel
 from rangecheck.surface.surface import Surface
 
@@ -139,6 +139,12 @@ def boundary_edges(surface: Surface | IntArray) -> IntArray:
     half = table.halves[table.start[:-1][table.uses == 1]]
     face, side = half // 3, half % 3
     return np.stack([table.faces[face, side], table.faces[face, (side + 1) % 3]], axis=1).astype(np.int32)
+
+
+def faces_at_edges(surface: Surface, wanted: BoolArray) -> IntArray:
+    """(k,) faces at the edges that a mask over the edge table selects."""
+    table = edge_table(surface)
+    return np.unique(table.halves[np.repeat(wanted, table.uses)] // 3)
 
 
 def non_manifold_edges(surface: Surface | IntArray) -> IntArray:
