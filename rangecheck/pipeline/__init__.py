@@ -13,8 +13,9 @@ from rangecheck.pipeline.outcome import Outcome
 _WHERE = {
     "check": "inspect",
     "doctor": "health",
+    "draw": "views",
     "explain": "inspect",
-    "maps": "pictures",
+    "maps": "views",
     "materials": "inspect",
     "mesh": "shape",
     "render": "pictures",

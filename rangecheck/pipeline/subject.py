@@ -10,6 +10,7 @@ from rangecheck.arrays import FloatArray
 from rangecheck.config import Settings
 from rangecheck.errors import InputError
 from rangecheck.files import read_bytes, sha256
+from rangecheck.modeler.model import Model
 from rangecheck.optics import PinholeCamera
 from rangecheck.progress import Reporter
 from rangecheck.scan import RangeScan
@@ -26,6 +27,7 @@ class Subject:
     surface: Surface
     scans: list[RangeScan] = field(default_factory=list)
     method: str = "read"
+    model: Model | None = None
 
 
 def holds_scans(path: Path) -> bool:
@@ -64,11 +66,16 @@ def surface_of(scans: list[RangeScan], settings: Settings, reporter: Reporter) -
 
 def read_subject(path: str | Path, settings: Settings, unit: str | None, reporter: Reporter) -> Subject:
     """The surface behind `path`: a mesh file, or scans that are meshed first."""
+    from rangecheck.modeler import read_model
     from rangecheck.surface.mesh_files import read_mesh
 
     where = Path(path)
     if not where.exists():
         raise InputError(where, "does not exist; check the name")
+    if where.suffix.lower() == ".toml":
+        with reporter.stage("building the scene"):
+            model = read_model(where)
+        return Subject(model.name, model.surface, method="modelled", model=model)
     if holds_scans(where):
         scans = read_all_scans([where], unit, reporter)
         surface, method, _ = surface_of(scans, settings, reporter)

@@ -27,7 +27,8 @@ class Scene:
     surroundings     what shines from infinitely far away
     smooth           shade with normals interpolated between vertices instead of the faces' own
     smooth_of_part   the same, part by part, where given
-    vertex_normals   (n, 3) unit normals to shade with where smooth, if they are known better than the triangles tell
+    vertex_normals   unit normals to shade with where smooth, if they are known better than the triangles tell: (n, 3) one a vertex,
+                     or (m, 3, 3) one a corner, for surfaces with sharp edges
 
     Radiances hold one number, or one per wavelength of the materials. Raises SceneError when the numbers of wavelengths differ,
     a part lacks its material, or a source touches the surface."""
@@ -64,7 +65,9 @@ class Scene:
                     f"{name} has {count} radiances and the materials {self.channels} wavelengths; give 1 or {self.channels} radiances"
                 )
         if self.vertex_normals is not None:
-            known = require("vertex_normals", self.vertex_normals, (len(self.surface.vertices), 3), finite=True)
+            cornerwise = np.ndim(self.vertex_normals) == 3
+            shape = (len(self.surface.faces), 3, 3) if cornerwise else (len(self.surface.vertices), 3)
+            known = require("vertex_normals", self.vertex_normals, shape, finite=True)
             object.__setattr__(self, "vertex_normals", known)
         for source in self.sources:
             self._keep_apart(source)
@@ -103,7 +106,7 @@ class Scene:
         chosen = np.asarray(smooth)[self.surface.part_of_face]
         if chosen.any():
             known = self.surface.vertex_normals if self.vertex_normals is None else self.vertex_normals
-            rounded = known[self.surface.faces[chosen]]
+            rounded = known[chosen] if known.ndim == 3 else known[self.surface.faces[chosen]]
             blank = (rounded == 0).all(axis=-1, keepdims=True)
             normals[chosen] = np.where(blank, normals[chosen], rounded)
         return normals

@@ -1,0 +1,162 @@
+"""Where pictures are taken from, and what needs no light: maps and line drawings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from rangecheck.animation import Orbit, orbit_around
+from rangecheck.arrays import FloatArray
+from rangecheck.config import Settings
+from rangecheck.errors import InputError, OutputError
+from rangecheck.export.camera_files import write_camera_json
+from rangecheck.export.map_files import write_chain, write_maps, write_shadows
+from rangecheck.maps import Maps, back_projection_error, require_outside, trace_chain, trace_maps, trace_shadows
+from rangecheck.optics import PinholeCamera
+from rangecheck.pipeline.folder import check_free, check_writable
+from rangecheck.pipeline.outcome import Outcome, document
+from rangecheck.pipeline.subject import Subject, read_subject
+from rangecheck.progress import Reporter
+from rangecheck.raycast import EmbreeCaster
+from rangecheck.rigid import look_at
+from rangecheck.surface import Surface
+
+
+def camera_of(settings: Settings) -> PinholeCamera:
+    """The pinhole camera of the settings."""
+    picture = settings.picture
+    return PinholeCamera.from_field_of_view(picture.width, picture.height, picture.field_of_view_deg)
+
+
+def orbit_of(surface: Surface, settings: Settings) -> Orbit:
+    """The tightest orbit whose every frame holds the whole surface."""
+    turn = settings.turntable
+    return orbit_around(surface, camera_of(settings), frames=turn.frames, elevation_deg=turn.elevation_deg, margin=turn.margin)
+
+
+def view_of(subject: Subject, settings: Settings, camera_mm: tuple[float, ...] | None) -> tuple[PinholeCamera, FloatArray]:
+    """The camera and its pose: at `camera_mm` looking at the middle of the object; else as a modelled scene's own file says; else
+    the first view of the orbit. Raises SceneError when that is inside the object."""
+    camera, surface, model = camera_of(settings), subject.surface, subject.model
+    if camera_mm is not None:
+        pose = look_at(camera_mm, surface.bounds_mm.mean(axis=0))
+    elif model is not None and model.camera is not None and model.world_from_camera is not None:
+        camera, pose = model.camera, model.world_from_camera
+    else:
+        pose = orbit_of(surface, settings).world_from_camera(0)
+    require_outside(surface, camera, pose)
+    return camera, pose
+
+
+def refuse_existing(path: str | Path, force: bool) -> None:
+    """Raise OutputError when `path` exists and may not be replaced, or cannot be written."""
+    check_writable(path)
+    if Path(path).exists() and not force:
+        raise OutputError(path, "exists already; pass --force to replace it")
+
+
+def map_at(surface: Surface, settings: Settings, azimuth_deg: float) -> tuple[Maps, str]:
+    """Maps from a focal point of its own orbit at `azimuth_deg`, and where that is in words."""
+    camera = camera_of(settings)
+    orbit = orbit_around(
+        surface,
+        camera,
+        frames=1,
+        elevation_deg=settings.maps.elevation_deg,
+        margin=settings.turntable.margin,
+        start_deg=azimuth_deg,
+    )
+    pose = orbit.world_from_camera(0)
+    eye = ", ".join(f"{x:.0f}" for x in pose[:3, 3])
+    return trace_maps(surface, camera, pose), f"focal point at ({eye}) mm"
+
+
+def maps(
+    path: str,
+    out: str,
+    *,
+    settings: Settings,
+    unit: str | None,
+    camera_mm: tuple[float, ...] | None,
+    bounces: int = 1,
+    force: bool,
+    reporter: Reporter,
+) -> Outcome:
+    """All maps of what is in `path` from one focal point, proved by projecting them back onto the surface; for a modelled scene
+    also the chain of surfaces that its mirror rays meet, and its sources' shadows."""
+    check_free(out, "maps.npz", force=force)
+    subject = read_subject(path, settings, unit, reporter)
+    camera, pose = view_of(subject, settings, camera_mm)
+    surface, model = subject.surface, subject.model
+    normals = None if model is None else model.normals_at
+    with reporter.stage("measuring"):
+        caster = EmbreeCaster(surface.vertices, surface.faces)
+        measured = trace_maps(surface, camera, pose, caster)
+        chain = trace_chain(surface, measured, caster, bounces=bounces, normals=normals)
+        proof = back_projection_error(surface, measured)
+    with reporter.stage("writing"):
+        eye = ", ".join(f"{x:.0f}" for x in pose[:3, 3])
+        written = write_maps(out, measured, subtitle=f"focal point at ({eye}) mm")
+        written += write_chain(out, measured, chain)
+        if model is not None and model.lamps:
+            lamps = np.array([(*lamp.centre_mm, 1.0) for lamp in model.lamps])
+            shadows = trace_shadows(surface, measured, lamps, caster, normals=normals, lift_mm=2 * model.tolerance_mm)
+            written += write_shadows(out, shadows, [f"source {k + 1}" for k in range(len(lamps))])
+        write_camera_json(Path(out) / "camera.json", camera, pose)
+    nearest, farthest = float(np.nanmin(measured.distance_mm)), float(np.nanmax(measured.distance_mm))
+    lines = [
+        f"{out}: {len(written) + 1} files; distances {nearest:.2f} to {farthest:.2f} mm over {int(measured.hit.sum()):,} pixels",
+        f"projected back, no point lies further than {proof.distance_max_mm:.2g} mm from the surface (bound {proof.bound_mm:.2g} mm)",
+    ]
+    if model is not None:
+        lines += [
+            f"  {seen} mirrors {met}: {pixels:,} pixels" for seen, met, pixels in chain.pairs(measured) if met != "nothing"
+        ][:12]
+    return Outcome(
+        document(
+            "maps",
+            files=written,
+            nearest_mm=nearest,
+            farthest_mm=farthest,
+            pixels=int(measured.hit.sum()),
+            part_names=surface.part_names,
+            back_projection={
+                "distance_max_mm": proof.distance_max_mm,
+                "depth_max_mm": proof.depth_max_mm,
+                "bound_mm": proof.bound_mm,
+                "holds": proof.holds,
+            },
+            camera=camera.to_dict(),
+            world_from_camera=pose,
+            seconds=reporter.seconds,
+        ),
+        lines,
+        proof.holds,
+    )
+
+
+def draw(
+    path: str, out: str, *, settings: Settings, camera_mm: tuple[float, ...] | None, hidden: bool, force: bool, reporter: Reporter
+) -> Outcome:
+    """A line drawing of a modelled scene as SVG."""
+    from rangecheck.modeler import draw as draw_lines
+    from rangecheck.modeler import write_svg
+
+    if Path(out).suffix.lower() != ".svg":
+        raise OutputError(out, "must end in .svg")
+    refuse_existing(out, force)
+    subject = read_subject(path, settings, None, reporter)
+    if subject.model is None:
+        raise InputError(
+            path, "is no modelled scene; a line drawing needs faces that know their edges, as a scene's .toml file gives them"
+        )
+    camera, pose = view_of(subject, settings, camera_mm)
+    with reporter.stage("drawing"):
+        drawing = draw_lines(subject.model, camera, pose, hidden=hidden)
+    write_svg(out, drawing, subject.name, force=force)
+    visible = sum(line.visible for line in drawing.lines)
+    return Outcome(
+        document("draw", output=out, lines=len(drawing.lines), visible=visible, camera=camera.to_dict(), world_from_camera=pose),
+        [f"{out}: {visible} visible lines of {len(subject.surface.part_names)} faces"],
+    )
