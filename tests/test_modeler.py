@@ -277,6 +277,12 @@ def test_a_mesh_file_can_take_part_in_booleans(tmp_path):
         ({"body": [{"name": "s", "shape": "sphere", "radius_mm": 1e6}], "tolerance_mm": 1e-6}, "larger tolerance"),
         ({"body": [BOX], "camera": {"width": 10}}, "camera lacks"),
         ({"body": [BOX], "source": [{"at_mm": [0, 0, 0]}]}, "source 1 lacks"),
+        (
+            {"body": [{"name": "c", "shape": "cylinder", "radius_mm": 1e8, "height_mm": 1}], "tolerance_mm": 1e-5},
+            "larger tolerance",
+        ),
+        ({"body": [BOX | {"shape": [1]}]}, "shape is"),
+        ({"body": [{"name": "r", "shape": "revolved", "outline_mm": [[0, 0], [1e300, 0], [5, 5]]}]}, "list of points"),
         ({"body": "x"}, "no .*body"),
         ({"body": [3]}, "a body is a table"),
     ],

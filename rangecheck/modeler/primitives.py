@@ -40,6 +40,18 @@ class Body:
         )
 
 
+#: no body is cut into more facets than this: a scene that needs more has a tolerance that nobody can see
+MOST_FACETS = 1_000_000
+
+
+def _afford(facets: float, name: str, error_mm: float) -> None:
+    if facets > MOST_FACETS:
+        raise SceneError(
+            f"{name}: a tolerance of {error_mm:g} mm needs about {facets:.2g} facets; at most {MOST_FACETS:g} are made: take a larger "
+            "tolerance_mm"
+        )
+
+
 _UP = rigid.identity()
 _SIDEWAYS = {
     "right": rigid.about_axis((0, 0, 1), -math.pi / 2),
@@ -75,8 +87,10 @@ def sheet(size_mm: Sequence[float]) -> Body:
     return Body(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.zeros(2, int), ("top",), (TrueFace("plane"),))
 
 
-def sphere(radius_mm: float, error_mm: float) -> Body:
+def sphere(radius_mm: float, error_mm: float, name: str = "sphere") -> Body:
     """Sphere about the origin: an octahedron whose faces are cut evenly in angle; one face, `surface`."""
+    # facets of an even octahedral sphere sag by about 0.85 r / count^2
+    _afford(8 * 0.85 * radius_mm / error_mm, name, error_mm)
     count = 2
     while True:
         vertices, faces = _octahedral_sphere(count)
@@ -85,9 +99,9 @@ def sphere(radius_mm: float, error_mm: float) -> Body:
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         inner = np.abs((corners[:, 0] * normal).sum(axis=1)) / np.linalg.norm(normal, axis=1)
         sag = radius_mm * (1 - float(inner.min()))
-        if sag <= error_mm or count >= 1024:
+        if sag <= error_mm:
             break
-        count = min(1024, max(count + 1, math.ceil(count * math.sqrt(sag / error_mm) * 0.98)))
+        count = max(count + 1, math.ceil(count * math.sqrt(sag / error_mm) * 0.98))
     return Body(radius_mm * vertices, faces, np.zeros(len(faces), int), ("surface",), (TrueFace("sphere", radius_mm),))
 
 
@@ -141,6 +155,7 @@ def revolved(points: Sequence[Sequence[float]], names: Sequence[str], error_mm: 
     widest = float(start[:, 0].max())
     # arcs of the outline share the error with the turn
     around = max(8, arc_chords(widest, 2 * math.pi, error_mm / 2 if any(s.radius for s in outline) else error_mm))
+    _afford(2.0 * around * len(start), name, error_mm)
     angle = 2 * math.pi * np.arange(around) / around
     ring = np.stack([np.cos(angle), np.zeros(around), -np.sin(angle)], axis=1)
     n = len(start)

@@ -15,6 +15,8 @@ import numpy as np
 from rangecheck.arrays import FloatArray
 from rangecheck.errors import SceneError
 
+MOST_CHORDS = 200_000
+
 
 @dataclass(frozen=True)
 class Segment:
@@ -32,6 +34,8 @@ class Segment:
         if not self.radius:
             return np.array([self.p])
         count = arc_chords(self.radius, abs(self.sweep_rad), error_mm)
+        if count > MOST_CHORDS:
+            raise SceneError(f"a tolerance of {error_mm:g} mm cuts an arc into {count} chords; at most {MOST_CHORDS} are made")
         angle = self.start_rad + self.sweep_rad * np.arange(count) / count
         points = np.stack([self.centre[0] + self.radius * np.cos(angle), self.centre[1] + self.radius * np.sin(angle)], axis=1)
         points[0] = self.p
