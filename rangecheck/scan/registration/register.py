@@ -97,7 +97,7 @@ def register(
         decision = decide(samples, result.poses, rules, held=hold > 0)
         if len(decision.largest()) < n:
             # a scan at a wrong place pulls others with it: once more without the pairs that contradict each other
-            pairs = [
+            peaceful = [
                 q for p, (pair, *_) in decision.judged.items() if pair.intruding <= rules.most_intruding for q in (p, p[::-1])
             ]
             again = align_jointly(samples, start, levels=levels, hold=hold, pairs=peaceful)
