@@ -30,7 +30,8 @@ _R20, _R21, _R22 = _SP * _SR * _CY + _CP * _SY, -_SP * _CR, -_SP * _SR * _SY + _
 def _skull(x, y, z):
     back = ellipsoid(x, y, z, 0.0, 65.0, -9.0, 33.5, 34.0, 33.5)
     front = ellipsoid(x, y, z, 0.0, 65.0, 10.0, 29.0, 33.0, 34.5)
-    return blend_min(back, front, 12.0)
+    dome = ellipsoid(x, y, z, 0.0, 68.0, -5.0, 25.0, 34.5, 29.0)
+    return blend_min(blend_min(back, front, 12.0), dome, 10.0)
 
 
 @kernel
@@ -143,7 +144,7 @@ def _ear(x, y, z, d):
     front = ramp(c, -1.0, 1.0)
     shell = shell - (relief - hollow) * front
     d = blend_min(d, shell, 2.2)
-    return blend_min(d, ellipsoid(a, b, c, 6.4, -1.5, 1.2, 1.8, 2.6, 1.8), 1.6)
+    return blend_min(d, ellipsoid(a, b, c, 6.2, -1.5, 0.5, 1.7, 2.8, 1.6), 2.4)
 
 
 @kernel
