@@ -127,6 +127,19 @@ def test_embree_and_the_oracle_see_the_same_map(camera):
     assert back_projection_error(surface, fast).holds
 
 
+def test_pixels_without_a_ray_see_nothing_and_do_not_disturb_their_neighbours():
+    surface = ball(subdivisions=1)
+    folding = PinholeCamera(41, 31, 30, 30, 20, 15, (-0.9,))
+    _, directions = folding.pixel_rays()
+    lost = np.isnan(directions).any(axis=-1)
+    assert 0.1 < lost.mean() < 0.9
+    pose = rigid.look_at((0, 0, 70), (0, 0, 0))
+    maps = trace_maps(surface, folding, pose)
+    assert not maps.hit[lost].any()
+    slow = trace_maps(surface, folding, pose, BruteCaster(surface.vertices, surface.faces))
+    np.testing.assert_allclose(maps.distance_mm, slow.distance_mm, atol=1e-6 * surface.extent_mm)
+
+
 def test_a_focal_point_inside_the_solid_is_refused_and_one_in_its_cavity_is_not():
     outer, inner = ball(50), ball(30)
     hollow = Surface(

@@ -9,9 +9,10 @@ from rangecheck import kernels, rigid
 from rangecheck.errors import ArrayError
 from rangecheck.export.map_files import write_chain, write_shadows, write_value_map
 from rangecheck.export.pictures import read_map_png16, read_png
-from rangecheck.maps import smooth_normals, trace_chain, trace_maps, trace_shadows, values_seen
+from rangecheck.maps import back_projection_error, smooth_normals, trace_chain, trace_maps, trace_shadows, values_seen
 from rangecheck.maps.shadow import LIT, NOTHING, SHADED, TURNED_AWAY
 from rangecheck.optics import PinholeCamera
+from rangecheck.raycast import EmbreeCaster
 from rangecheck.surface import Surface
 from rangecheck.surface.surface import join
 
@@ -149,8 +150,12 @@ def test_wrong_questions_are_refused():
     maps = trace_maps(surface, PinholeCamera.from_field_of_view(21, 21, 45), rigid.look_at((160, 140, 170), (35, 35, 35)))
     with pytest.raises(ArrayError, match="bounces is 0"):
         trace_chain(surface, maps, bounces=0)
-    with pytest.raises(ArrayError, match="the surface has 2"):
-        trace_chain(rectangle((0, 0, 0), (1, 0, 0), (0, 1, 0), "a"), maps)
+    other = rectangle((0, 0, 0), (1, 0, 0), (0, 1, 0), "a")
+    for question in (trace_chain, back_projection_error, lambda s, m: trace_shadows(s, m, [[0, 1, 0, 0]])):
+        with pytest.raises(ArrayError, match="the surface has 2; maps, caster and surface must belong together"):
+            question(other, maps)
+    with pytest.raises(ArrayError, match="must belong together"):
+        trace_maps(other, maps.camera, maps.world_from_camera, EmbreeCaster(surface.vertices, surface.faces), allow_inside=True)
     with pytest.raises(ArrayError, match=r"points \(x, y, z, 1\) or directions"):
         trace_shadows(surface, maps, [[0, 0, 0, 0]])
     with pytest.raises(ArrayError, match="values has 5 entries"):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rangecheck.arrays import FloatArray
-from rangecheck.maps.trace import Maps
+from rangecheck.maps.trace import Maps, require_same
 from rangecheck.rigid import move_points
 from rangecheck.surface import Surface
 
@@ -53,6 +53,7 @@ def point_triangle_mm(points_mm: FloatArray, triangles: FloatArray) -> FloatArra
 
 def back_projection_error(surface: Surface, maps: Maps) -> BackProjection:
     """Send every pixel back, once by its distance and once by its depth, and measure how far it lands from the face it hit."""
+    require_same(surface, maps.face)
     origins, directions = maps.camera.pixel_rays()
     axial = directions[..., 2]
     hit = maps.hit

@@ -14,7 +14,7 @@ import numpy as np
 from rangecheck.arrays import FloatArray, IntArray
 from rangecheck.errors import ArrayError
 from rangecheck.kernels import in_chunks, kernel
-from rangecheck.maps.trace import PIXELS_PER_CHUNK, Caster, Maps, measure_hits
+from rangecheck.maps.trace import PIXELS_PER_CHUNK, Caster, Maps, measure_hits, require_same
 from rangecheck.raycast import EmbreeCaster
 from rangecheck.surface import Surface
 from rangecheck.surface.attributes import barycentric
@@ -100,8 +100,7 @@ def trace_chain(
     mirrors. Raises ArrayError when `maps` are not of this surface."""
     if bounces < 1:
         raise ArrayError(f"bounces is {bounces}; at least one reflection is needed for a secondary ID", name="bounces")
-    if maps.face.size and maps.face.max() >= len(surface.faces):
-        raise ArrayError(f"the maps name face {maps.face.max()}; the surface has {len(surface.faces)}", name="maps")
+    require_same(surface, maps.face)
     engine = caster if caster is not None else EmbreeCaster(surface.vertices, surface.faces)
     pixels = np.flatnonzero(maps.hit)
     faces = np.full((bounces, maps.face.size), -1, np.int32)
@@ -121,6 +120,7 @@ def trace_chain(
             origins = np.empty_like(point)
             reflect(directions, facet, normal, point, skin_mm, origins)
             hits = engine.closest(origins, directions)
+            require_same(surface, hits.face)
             distance = hits.distance_mm.copy()
             measure_hits(
                 origins, directions, surface.vertices, surface.faces, hits.face, distance,

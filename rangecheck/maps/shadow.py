@@ -14,7 +14,7 @@ from rangecheck.arrays import BoolArray, FloatArray, IntArray, require, unit_vec
 from rangecheck.errors import ArrayError
 from rangecheck.kernels import in_chunks
 from rangecheck.maps.secondary import SKIN, NormalsAt
-from rangecheck.maps.trace import PIXELS_PER_CHUNK, Caster, Maps
+from rangecheck.maps.trace import PIXELS_PER_CHUNK, Caster, Maps, require_same
 from rangecheck.raycast import EmbreeCaster
 from rangecheck.surface import Surface
 from rangecheck.surface.attributes import barycentric
@@ -60,6 +60,7 @@ def trace_shadows(
     lamps = require("sources", sources, (None, 4), finite=True)
     if not np.isin(lamps[:, 3], (0.0, 1.0)).all() or (np.linalg.norm(lamps[lamps[:, 3] == 0, :3], axis=1) == 0).any():
         raise ArrayError("sources must be points (x, y, z, 1) or directions (x, y, z, 0) that are not zero", name="sources")
+    require_same(surface, maps.face)
     engine = caster if caster is not None else EmbreeCaster(surface.vertices, surface.faces)
     pixels = np.flatnonzero(maps.hit)
     points, seen_face = maps.points_mm().reshape(-1, 3)[pixels], maps.face.ravel()[pixels]
@@ -94,6 +95,7 @@ def values_seen(surface: Surface, maps: Maps, values: FloatArray) -> FloatArray:
     """(h, w) float64 map of a value carried by the surface - deviation, expected error, wall thickness: one number per vertex
     (interpolated) or per face (as it is); NaN where nothing is seen. Raises ArrayError for any other length."""
     numbers = require("values", values, (None,))
+    require_same(surface, maps.face)
     seen = np.full(maps.face.shape, np.nan)
     face = maps.face[maps.hit]
     if len(numbers) == len(surface.vertices):

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from rangecheck.arrays import BoolArray, FloatArray, IntArray
-from rangecheck.errors import SceneError
+from rangecheck.errors import ArrayError, SceneError
 from rangecheck.kernels import in_chunks, kernel
 from rangecheck.maps.inside import require_outside
 from rangecheck.optics import Camera
@@ -117,6 +117,15 @@ def measure_hits(origins_mm, directions, vertices_mm, faces, face, distance_mm, 
             distance_mm[i] = x * dx + y * dy + z * dz
 
 
+def require_same(surface: Surface, face: IntArray) -> None:
+    """Raises ArrayError when faces (any shape) are named that the surface does not have: they are of another surface."""
+    if face.size and face.max() >= len(surface.faces):
+        raise ArrayError(
+            f"face {face.max()} is named, and the surface has {len(surface.faces)}; maps, caster and surface must belong together",
+            name="face",
+        )
+
+
 def closest_of_picture(caster: Caster, origins_mm: FloatArray, directions: FloatArray) -> Hits:
     """First hits of rays that lie side by side in a picture."""
     if isinstance(caster, EmbreeCaster):
@@ -154,6 +163,7 @@ def trace_maps(
         world_origins, world_directions = np.empty((stop - start, 3)), np.empty((stop - start, 3))
         rays_to_world(pose, origins, directions, world_origins, world_directions)
         hits = closest_of_picture(engine, world_origins, world_directions)
+        require_same(surface, hits.face)
         distance[here], face[here] = hits.distance_mm, hits.face
         measure_hits(
             world_origins,
