@@ -7,8 +7,11 @@ from .common import common, settings_from
 
 @click.command("turntable", short_help="Frames and video of an orbit; resumes where it was stopped.")
 @click.argument("scene", type=click.Path())
+@click.option("--scheduler", metavar="ADDRESS", help="Make the frames on a dask cluster, for example tcp://10.0.0.1:8786.")
 @common("out_file", "unit", "size", "frames", "frames_dir", "material", "tolerance", "seed", "config", "set", "force")
-def command(scene, out, unit, size, frames, frames_dir, material, tolerance, seed, config, assignments, force, reporter):
+def command(
+    scene, scheduler, out, unit, size, frames, frames_dir, material, tolerance, seed, config, assignments, force, reporter
+):
     """Frames and video of an orbit; resumes where it was stopped.
 
     Frames are kept beside the video (or in --frames-dir), keyed by everything that determines them: a stopped run goes on, and
@@ -26,4 +29,6 @@ def command(scene, out, unit, size, frames, frames_dir, material, tolerance, see
         picture__width=size and size[0],
         picture__height=size and size[1],
     )
-    return turntable(scene, out, settings=settings, unit=unit, frames_dir=frames_dir, force=force, reporter=reporter)
+    return turntable(
+        scene, out, settings=settings, unit=unit, frames_dir=frames_dir, scheduler=scheduler, force=force, reporter=reporter
+    )

@@ -23,7 +23,7 @@ _WHERE = {
     "sample": "shape",
     "simulate": "shape",
     "solid": "shape",
-    "turntable": "pictures",
+    "turntable": "turning",
 }
 
 __all__ = ["Outcome", *_WHERE]

@@ -22,9 +22,9 @@ from rangecheck.pipeline.folder import check_free, job_folder, key_of
 from rangecheck.pipeline.health import versions
 from rangecheck.pipeline.inspect import scan_facts
 from rangecheck.pipeline.outcome import Outcome, document
-from rangecheck.pipeline.pictures import Rendered, render_turntable
 from rangecheck.pipeline.shape import findings_lines, solid_of
 from rangecheck.pipeline.subject import eye_of, hashes, read_all_scans, surface_of
+from rangecheck.pipeline.turning import Rendered, render_turntable
 from rangecheck.pipeline.views import map_at, orbit_of
 from rangecheck.progress import Reporter
 from rangecheck.scan import RangeScan
