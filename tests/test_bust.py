@@ -104,6 +104,24 @@ def test_the_same_bytes_on_any_number_of_threads(rays):
         assert bust_first_hit(origins, directions).tobytes() == alone.tobytes()
 
 
+def test_compiled_and_interpreted_agree(on_surface, tmp_path):
+    import os
+    import subprocess
+    import sys
+
+    points = on_surface[::150] + 0.3
+    np.save(tmp_path / "points.npy", points)
+    np.save(tmp_path / "heights.npy", bust.height_map())
+    program = (
+        "import sys, numpy as np\n"
+        "from rangecheck.analytic.bust_form import bust_function\n"
+        "points, heights = (np.load(f'{sys.argv[1]}/{name}.npy') for name in ('points', 'heights'))\n"
+        "np.save(f'{sys.argv[1]}/values.npy', [bust_function(*p, heights) for p in points])\n"
+    )
+    subprocess.run([sys.executable, "-c", program, str(tmp_path)], env=os.environ | {"NUMBA_DISABLE_JIT": "1"}, check=True)
+    np.testing.assert_allclose(np.load(tmp_path / "values.npy"), bust._values(points), rtol=1e-12, atol=1e-12)
+
+
 def test_rays_that_pass_by_miss(rays):
     origins, directions, _ = rays
     assert np.isinf(bust_first_hit(origins, -directions)).all()

@@ -56,6 +56,15 @@ def test_a_subject_that_comes_nearer_is_measured_where_it_was_when_the_sheet_pas
     np.testing.assert_allclose(made.true_range_mm * CAMERA.pixel_rays()[1][..., 2], 600.0, atol=1e-3)
 
 
+def test_cells_that_never_settle_are_lost_not_guessed():
+    # too fast for its sheet: where the edge of the plate runs away, cells meet now the plate, now the wall
+    motion = Motion(velocity_mm_s=(900.0, 0.0, 0.0))
+    made = simulate_scan(plates(WALL, (200.0, 60.0, 0.0)), CAMERA, POSE, RangeFinder(**QUIET), 1, motion=motion)
+    measured = made.reason == MEASURED
+    here = np.where(measured, depth(made), 400.0)
+    assert (np.minimum(np.abs(here - 400.0), np.abs(here - 600.0)) < 2e-3).all()
+
+
 def test_a_wall_that_slides_in_its_own_plane_looks_still():
     moved = simulate_scan(plates(WALL), CAMERA, POSE, RangeFinder(**QUIET), 1, motion=Motion(velocity_mm_s=(30.0, 5.0, 0.0)))
     np.testing.assert_allclose(depth(moved), 600.0, atol=1e-3)

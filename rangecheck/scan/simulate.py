@@ -94,7 +94,7 @@ def simulate_scan(
 
     view = truth
     time: FloatArray = np.zeros(len(rays))
-    flying = np.zeros(len(rays), bool)
+    flying, settled = np.zeros(len(rays), bool), np.ones(len(rays), bool)
     if finder.kind == "time-of-flight":
         mixed = phases(
             caster, camera, pose, np.asarray(finder.source_mm), modulation_mhz=finder.modulation_mhz,
@@ -109,7 +109,7 @@ def simulate_scan(
         seen, lit = np.isfinite(ideal), np.isfinite(ideal)
     else:
         if motion is not None:
-            view, time = swept(caster, origins, rays, source, pose, finder, finish, motion)
+            view, time, settled = swept(caster, origins, rays, source, pose, finder, finish, motion)
         signal, ideal = view.signal(finder.working_distance_mm), view.distance_mm
         seen, lit = view.seen, view.lit
         noise = triangulation_noise(finder, view, pose, origins, rays, source, signal)
@@ -127,7 +127,7 @@ def simulate_scan(
     reason = np.full(len(rays), MEASURED, np.uint8)
     reason[flying] = FLYING
     outside = (ideal < finder.nearest_mm) | (ideal > finder.farthest_mm) | ~(measured > 0) | ~np.isfinite(measured)
-    reason[(draws[2] < finder.lost_share) | outside] = LOST
+    reason[(draws[2] < finder.lost_share) | outside | ~settled] = LOST
     reason[signal + finder.ambient > finder.most_signal] = SATURATED
     reason[(signal < finder.least_signal) | (contrast < finder.least_contrast) | ~(np.isfinite(noise) | ~seen)] = TOO_DARK
     reason[away & ~flying] = TOO_OBLIQUE

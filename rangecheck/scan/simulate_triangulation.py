@@ -9,12 +9,15 @@ import math
 import numpy as np
 
 from rangecheck import rigid
-from rangecheck.arrays import FloatArray
+from rangecheck.arrays import BoolArray, FloatArray
 from rangecheck.errors import SettingError
 from rangecheck.optics import Camera, PinholeCamera
 from rangecheck.scan.simulate_finder import RangeFinder
 from rangecheck.scan.simulate_noise import kinect_noise, photon_noise, speckle_noise
 from rangecheck.scan.simulate_view import Caster, Finish, Motion, View, look
+
+#: the sheet of light counts as on the point it meets within this angle, 1e-3 mm at 600 mm; and how often that is tried
+_SETTLED_DEG, _SWEEPS = 1e-4, 10
 
 
 def _sweep_frame(pose: FloatArray, source: FloatArray, finder: RangeFinder) -> tuple[FloatArray, FloatArray]:
@@ -34,18 +37,23 @@ def swept(
     finder: RangeFinder,
     finish: Finish,
     motion: Motion,
-) -> tuple[View, FloatArray]:
-    """What each cell meets when the sheet of light passes it: the time depends on the point, the point on the time."""
+) -> tuple[View, FloatArray, BoolArray]:
+    """What each cell meets when the sheet of light passes it, when (n,), and whether that settled (n,): the time depends on the point, and
+    the point on the time. A cell that meets now one part of the subject, now another, has no answer."""
     middle, travel = _sweep_frame(pose, source, finder)
     time = np.zeros(len(rays))
     view = look(caster, origins, rays, source, finish=finish)
-    for _ in range(6):
+    settled = ~view.seen
+    for _ in range(_SWEEPS):
         with np.errstate(invalid="ignore"):
             to_point = origins + view.distance_mm[:, None] * rays - source
-            angle = np.arctan2(to_point @ travel, to_point @ middle)
-        time = np.where(view.seen, np.degrees(angle) / finder.sweep_deg_s, time)
+            angle = np.degrees(np.arctan2(to_point @ travel, to_point @ middle))
+            settled = ~view.seen | (np.abs(angle - time * finder.sweep_deg_s) < _SETTLED_DEG)
+        if settled.all():
+            break
+        time = np.where(view.seen, angle / finder.sweep_deg_s, time)
         view = look(caster, origins, rays, source, finish=finish, motion=motion, time_s=time)
-    return view, np.where(view.seen, time, 0.0)
+    return view, np.where(view.seen, time, 0.0), settled
 
 
 def triangulation_noise(
