@@ -1,0 +1,5 @@
+"""python -m rangecheck_cli"""
+
+from .main import main
+
+main()
