@@ -20,7 +20,7 @@ from rangecheck.export.pictures import write_id_png16, write_map_png16, write_pn
 from rangecheck.files import read_bytes, whole_file, write_json
 from rangecheck.maps import Chain, Maps, Shadows
 from rangecheck.maps.shadow import LIT, NOTHING, SHADED, STATE_NAMES, TURNED_AWAY
-from rangecheck.optics import camera_from_dict
+from rangecheck.optics import PinholeCamera, camera_from_dict
 
 SCHEMA = "rangecheck/maps/1"
 
@@ -94,8 +94,17 @@ def write_maps(folder: str | Path, maps: Maps, *, stem: str = "", subtitle: str 
         write_id_png16(named("part_id_16bit.png"), maps.part_id, maps.part_names, force=force)
         picture = coloured_ids(maps.part_id, maps.part_names, "Surface seen first", subtitle=subtitle)
         write_png(named("part_id.png"), picture, force=force)
-    write_png(named("contours.png"), contour_picture(maps.depth_mm, title="Contours of depth"), force=force)
+    write_png(
+        named("contours.png"), contour_picture(maps.depth_mm, pixel_mm=_pixel_mm(maps), title="Contours of depth"), force=force
+    )
     return written
+
+
+def _pixel_mm(maps: Maps) -> float | None:
+    """Width of a pixel at the median depth of a pinhole camera's picture; None for others and for empty ones."""
+    if isinstance(maps.camera, PinholeCamera) and maps.hit.any():
+        return abs(float(np.nanmedian(maps.depth_mm))) / maps.camera.fx or None
+    return None
 
 
 def write_chain(folder: str | Path, maps: Maps, chain: Chain, *, stem: str = "", force: bool = True) -> list[Path]:
@@ -107,7 +116,9 @@ def write_chain(folder: str | Path, maps: Maps, chain: Chain, *, stem: str = "",
         np.savez_compressed(stream, allow_pickle=False, part_ids=chain.part_ids, faces=chain.faces)
     rows = [{"surface": a, "mirrors": b, "pixels": n} for a, b, n in chain.pairs(maps)]
     write_json(paths[1], {"schema": "rangecheck/reflections/1", "part_names": list(chain.part_names), "pairs": rows}, force=force)
-    write_png(paths[2], coloured_ids(chain.secondary_id, chain.part_names, "Surface seen in the mirror"), force=force)
+    write_png(
+        paths[2], coloured_ids(chain.secondary_id, chain.part_names, "Surface seen in the mirror", seen=maps.hit), force=force
+    )
     for bounce, ids in enumerate(chain.part_ids):
         paths.append(where / f"{stem}secondary_id_{bounce + 1}_16bit.png")
         write_id_png16(paths[-1], ids, chain.part_names, force=force, reflection=bounce + 1)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rangecheck.arrays import FloatArray, IntArray, require
+from rangecheck.arrays import BoolArray, FloatArray, IntArray, require
 from rangecheck.errors import ArrayError
 from rangecheck.export import legend
 from rangecheck.export.pictures import Picture
@@ -67,17 +67,32 @@ def coloured_map(
     return legend.framed(picture, title, subtitle, legend.ColourScale(low, high, unit, colours))
 
 
-def coloured_ids(ids: IntArray, names: Sequence[str], title: str, *, subtitle: str = "", picture_px: int = PICTURE_PX) -> Picture:
-    """Picture (H, W, 3) of an ID map (h, w), 0 = none, ID k named names[k - 1]; only the IDs that are seen enter the legend."""
+def coloured_ids(
+    ids: IntArray,
+    names: Sequence[str],
+    title: str,
+    *,
+    subtitle: str = "",
+    seen: BoolArray | None = None,
+    picture_px: int = PICTURE_PX,
+) -> Picture:
+    """Picture (H, W, 3) of an ID map (h, w), 0 = none, ID k named names[k - 1]; only the IDs that occur enter the legend.
+
+    `seen` (h, w) tells pixels that see a surface but mirror nothing from the background."""
     numbers = require("ids", ids, (None, None), np.int64)
     if numbers.size and (numbers.min() < 0 or numbers.max() > len(names)):
         raise ArrayError(f"ids run from {numbers.min()} to {numbers.max()}; there are {len(names)} names", name="ids")
     colours = np.concatenate([np.array([legend.NOTHING], np.uint8), legend.category_colours(len(names))])
-    seen = [int(k) for k in np.unique(numbers) if k > 0]
-    picture = _enlarged(colours[numbers], _zoom(numbers.shape, picture_px))
-    subtitle = subtitle or f"{len(seen)} of {len(names)} surfaces seen"
-    swatches = legend.Swatches(colours[seen], tuple(f"{k}  {names[k - 1]}" for k in seen))
-    return legend.framed(picture, title, subtitle, swatches)
+    present = [int(k) for k in np.unique(numbers) if k > 0]
+    picture = colours[numbers]
+    swatches, words = colours[present], [f"{k}  {names[k - 1]}" for k in present]
+    if seen is not None:
+        bare = seen & (numbers == 0)
+        picture[bare] = legend.UNMIRRORED
+        swatches, words = np.concatenate([swatches, np.array([legend.UNMIRRORED], np.uint8)]), [*words, "0  nothing"]
+    subtitle = subtitle or f"{len(present)} of {len(names)} surfaces seen"
+    enlarged = _enlarged(picture, _zoom(numbers.shape, picture_px))
+    return legend.framed(enlarged, title, subtitle, legend.Swatches(swatches, tuple(words)))
 
 
 def relief_shading(depth: FloatArray, pixel: float) -> FloatArray:
