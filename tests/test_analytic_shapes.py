@@ -88,7 +88,7 @@ def test_volume_and_area_agree_with_counting_points(shape):
     share = shape.volume / box
     assert abs(inside.mean() - share) < 5 * math.sqrt(share * (1 - share) / n)
 
-    radius, lines = 60.0, 20000
+    radius, lines = (44.0 if isinstance(shape, Cone) else 30.0), 40000
     ends = random.normal(size=(2, lines, 3))
     ends *= radius / np.linalg.norm(ends, axis=-1, keepdims=True)
     origins, directions = ends[0], ends[1] - ends[0]
@@ -104,6 +104,19 @@ def test_volume_and_area_agree_with_counting_points(shape):
         )
     expected = shape.area / (2.0 * math.pi * radius**2)
     assert abs(crossings.mean() - expected) < 5 * crossings.std() / math.sqrt(lines)
+
+
+def test_area_is_the_growth_of_volume_under_a_thin_coat():
+    e = 1e-6
+    for thin, thick in (
+        (Sphere(20.0), Sphere(20.0 + e)),
+        (Torus(20.0, 7.0), Torus(20.0, 7.0 + e)),
+        (Box(30.0, 20.0, 44.0), Box(30.0 + 2 * e, 20.0 + 2 * e, 44.0 + 2 * e)),
+        (Cylinder(14.0, 30.0), Cylinder(14.0 + e, 30.0 + 2 * e)),
+        # a cone's faces move by e when its base moves by e and its apex by e (slant / radius)
+        (Cone(15.0, 40.0), Cone(15.0 * (1 + e * (1 + math.hypot(15, 40) / 15) / 40), 40.0 + e * (1 + math.hypot(15, 40) / 15))),
+    ):
+        assert (thick.volume - thin.volume) / e == pytest.approx(thin.area, rel=1e-5)
 
 
 def test_plane_is_met_from_either_side_and_not_by_parallels():
