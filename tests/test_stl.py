@@ -74,7 +74,7 @@ def test_existing_files_and_folders_are_respected(tmp_path):
         write_stl(solid, tmp_path / "folder")
 
 
-@pytest.mark.parametrize("suffix", ["ply", "obj", "off", "glb"])
+@pytest.mark.parametrize("suffix", ["ply", "obj", "off", "glb", "3mf"])
 def test_every_mesh_format_is_read_back_as_the_same_closed_surface(tmp_path, suffix):
     ring = torus(20, 12)
     parts = (ring.triangles.mean(axis=1)[:, 0] > 0).astype(np.int32)
@@ -86,7 +86,7 @@ def test_every_mesh_format_is_read_back_as_the_same_closed_surface(tmp_path, suf
     first = path.read_bytes()
     write_mesh(ring, path)
     assert path.read_bytes() == first
-    back = read_mesh(path, None if suffix == "glb" else "mm")
+    back = read_mesh(path, None if suffix in ("glb", "3mf") else "mm")
     assert topo.is_closed(back) and back.volume_mm3 == pytest.approx(ring.volume_mm3, rel=1e-12 if suffix != "glb" else 1e-5)
     assert len(back.vertices) == len(ring.vertices)
 
@@ -94,3 +94,15 @@ def test_every_mesh_format_is_read_back_as_the_same_closed_surface(tmp_path, suf
 def test_a_mesh_of_unknown_ending_is_refused(tmp_path):
     with pytest.raises(OutputError, match="a mesh ends in"):
         write_mesh(cube(), tmp_path / "x.step")
+
+
+@pytest.mark.parametrize("suffix", ["ply", "glb", "3mf"])
+def test_a_solid_in_any_format_is_read_back_and_judged(tmp_path, suffix):
+    write_mesh(Solid.from_surface(torus(24, 16)), tmp_path / f"ring.{suffix}")
+    thin = Solid.from_surface(Surface(CUBE_CORNERS * [5.0, 5.0, 0.5] + 2e7, CUBE_FACES))
+    if suffix == "glb":
+        with pytest.raises(NotSolid, match="read back"):
+            write_mesh(thin, tmp_path / "thin.glb")
+        assert not (tmp_path / "thin.glb").exists()
+    else:
+        write_mesh(thin, tmp_path / f"thin.{suffix}")

@@ -1,25 +1,29 @@
 """Meshes of surfaces and solids: PLY keeps everything, OBJ and OFF vertices and faces, GLB and STL what viewers and slicers read.
 
 PLY: binary, float64 positions, part and origin of each face (`origin`: 0 measured, 1 interpolated, 2 invented), expected error of each
-vertex where known. GLB: metres, as its specification has it, coloured by origin. STL of anything but a `Solid` is refused (see stl.py).
+vertex where known. GLB: metres, as its specification has it, coloured by origin. 3MF (core specification 1.3): millimetres, with metadata,
+as slicers take it. STL of anything but a `Solid` is refused; whatever is written of a `Solid` is read back and judged again (see stl.py).
 """
 
 from __future__ import annotations
 
+import io
 import json
 import struct
+import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rangecheck.errors import OutputError
-from rangecheck.export.stl import write_stl
+from rangecheck.export.stl import as_float32, proved_file, write_stl
 from rangecheck.files import whole_file
+from rangecheck.solid.rounding import collapse_flat_faces
 from rangecheck.solid.solid import Solid
 from rangecheck.surface.surface import ORIGIN_NAMES, Surface
 
-SUFFIXES = (".ply", ".obj", ".off", ".glb", ".stl")
+SUFFIXES = (".ply", ".obj", ".off", ".glb", ".3mf", ".stl")
 #: colours of measured, interpolated, invented faces in GLB, linear RGB
 ORIGIN_COLOURS = ((0.75, 0.75, 0.75), (0.35, 0.55, 0.85), (0.85, 0.4, 0.25))
 
@@ -27,18 +31,22 @@ ORIGIN_COLOURS = ((0.75, 0.75, 0.75), (0.35, 0.55, 0.85), (0.85, 0.4, 0.25))
 def write_mesh(surface: Surface | Solid, path: str | Path, *, force: bool = True) -> None:
     """Write a surface in mm to `path`, in the format of its ending, whole or not at all; same surface, same bytes.
 
-    Raises OutputError for an unknown ending, NotSolid for an STL of what is not a Solid."""
+    Raises OutputError for an unknown ending, NotSolid for an STL of what is not a Solid and for a Solid that its file no longer says."""
     suffix = Path(path).suffix.lower()
     if suffix == ".stl":
         write_stl(surface, path, force=force)
         return
+    proved = isinstance(surface, Solid)
     shape = surface.surface if isinstance(surface, Solid) else surface
+    if proved and suffix == ".glb":
+        # GLB holds float32 like STL
+        shape = collapse_flat_faces(as_float32(shape)[0])
     try:
-        content = {".ply": _ply, ".obj": _obj, ".off": _off, ".glb": _glb}[suffix](shape)
+        content = {".ply": _ply, ".obj": _obj, ".off": _off, ".glb": _glb, ".3mf": _3mf}[suffix](shape)
     except KeyError:
         raise OutputError(path, f"ends in {suffix or 'nothing'}; a mesh ends in {', '.join(SUFFIXES)}") from None
-    with whole_file(path, force=force) as part:
-        part.write_bytes(content)
+    with proved_file(path, force=force, must_be_solid=True) if proved else whole_file(path, force=force) as part:
+        (part[0] if isinstance(part, tuple) else part).write_bytes(content)
 
 
 def _ply(surface: Surface) -> bytes:
@@ -137,3 +145,42 @@ def _glb(surface: Surface) -> bytes:
     body += b"\0" * (-len(body) % 4)
     head = struct.pack("<III", 0x46546C67, 2, 12 + 8 + len(text) + 8 + len(body))
     return head + struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(body), 0x004E4942) + body
+
+
+_3MF_TYPES = """<?xml version="1.0" encoding="UTF-8"?>
+<Types xmlns="http://schemas.openxmlformats.org/package/2006/content-types">
+<Default Extension="rels" ContentType="application/vnd.openxmlformats-package.relationships+xml"/>
+<Default Extension="model" ContentType="application/vnd.ms-package.3dmanufacturing-3dmodel+xml"/>
+</Types>
+"""
+_3MF_LINKS = """<?xml version="1.0" encoding="UTF-8"?>
+<Relationships xmlns="http://schemas.openxmlformats.org/package/2006/relationships">
+<Relationship Target="/3D/3dmodel.model" Id="model" Type="http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"/>
+</Relationships>
+"""
+
+
+def _3mf(surface: Surface) -> bytes:
+    """A zip archive with one object; vertices keep the digits that tell their float64 values."""
+    shares = ", ".join(f"{name} {surface.share_of_area(k):.2%}" for k, name in enumerate(ORIGIN_NAMES))
+    rows = [
+        '<?xml version="1.0" encoding="UTF-8"?>',
+        '<model unit="millimeter" xml:lang="en-US" xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02">',
+        '<metadata name="Application">rangecheck</metadata>',
+        f'<metadata name="Description">share of area: {shares}</metadata>',
+        '<resources><object id="1" type="model"><mesh><vertices>',
+        *(f'<vertex x="{x!r}" y="{y!r}" z="{z!r}"/>' for x, y, z in surface.vertices.tolist()),
+        "</vertices><triangles>",
+        *(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in surface.faces.tolist()),
+        '</triangles></mesh></object></resources><build><item objectid="1"/></build></model>',
+    ]
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, text in (
+            ("[Content_Types].xml", _3MF_TYPES),
+            ("_rels/.rels", _3MF_LINKS),
+            ("3D/3dmodel.model", "\n".join(rows)),
+        ):
+            # a fixed date: the same solid gives the same bytes
+            archive.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), text, zipfile.ZIP_DEFLATED)
+    return stream.getvalue()

@@ -64,7 +64,8 @@ def proved_file(path: str | Path, *, force: bool, must_be_solid: bool) -> Iterat
     judged: list[Verdict] = []
     with whole_file(path, force=force) as part:
         yield part, judged
-        verdict = check_solid(open_mesh(part, "mm").surface)
+        # GLB and 3MF say their unit themselves
+        verdict = check_solid(open_mesh(part, None if part.suffix.lower() in (".glb", ".3mf") else "mm").surface)
         if must_be_solid and not verdict.fit:
             raise NotSolid(f"{path}: read back as float32 it is {verdict.sentence()}", findings=verdict.findings, verdict=verdict)
         judged.append(verdict)

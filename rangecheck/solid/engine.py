@@ -1,7 +1,8 @@
 """The one adapter of manifold3d (3.5): to it and back, keeping which face came from which.
 
 Its traps: float32 `Mesh` rounds, so `Mesh64` is used throughout; a refused mesh becomes an empty solid whose `status()` says why and
-which empties whatever it meets; faces with the same `face_id` may be merged where they are coplanar, so every face gets its own;
+which empties whatever it meets; `simplify` collapses edges between faces of the same `face_id` only, so every face gets its own unless
+that is wanted;
 vertices must be shared by index; booleans drop what is thinner than its tolerance (about 1e-12 of the extent in double precision).
 """
 
@@ -25,9 +26,10 @@ def _manifold3d() -> Any:
     return manifold3d
 
 
-def to_engine(surface: Surface) -> tuple[Any, int]:
+def to_engine(surface: Surface, face_id: IntArray | None = None) -> tuple[Any, int]:
     """The surface as a manifold3d solid, and the number by which its faces are known in later results.
 
+    `face_id` (m,) names faces that may be merged with their like by `simplify`; by default every face has its own name.
     Raises NotSolid, with the engine's word, when it is refused."""
     m3d = _manifold3d()
     name = int(m3d.Manifold.reserve_ids(1))
@@ -37,7 +39,7 @@ def to_engine(surface: Surface) -> tuple[Any, int]:
         tri_verts=faces,
         run_index=np.array([0, 3 * len(faces)], np.uint64),
         run_original_id=np.array([name], np.uint32),
-        face_id=np.arange(len(faces), dtype=np.uint64),
+        face_id=np.arange(len(faces), dtype=np.uint64) if face_id is None else np.ascontiguousarray(face_id, np.uint64),
     )
     solid = m3d.Manifold(mesh)
     status = solid.status()
@@ -47,6 +49,18 @@ def to_engine(surface: Surface) -> tuple[Any, int]:
             f"manifold3d refuses the surface ({word}); check_solid() says where it is not solid", word=word, findings=()
         )
     return solid, name
+
+
+def simplified(surface: Surface, tolerance_mm: float) -> Surface:
+    """`surface` with edges collapsed while its faces stay within about `tolerance_mm`; faces of different part or origin stay apart.
+
+    Raises NotSolid when the engine refuses the surface."""
+    kinds, kind = np.unique(np.stack([surface.part_of_face, surface.origin_of_face], axis=1), axis=0, return_inverse=True)
+    kind = kind.reshape(-1)
+    solid, number = to_engine(surface, kind)
+    # one face stands for each kind: what from_engine looks up is its part and origin
+    legend = Surface(np.zeros((1, 3)), np.zeros((len(kinds), 3), np.int32), kinds[:, 0], kinds[:, 1], surface.part_names)
+    return from_engine(solid.simplify(tolerance_mm), [(number, legend)], surface.part_names[0])
 
 
 def from_engine(solid: Any, sources: Sequence[tuple[int, Surface]], new_part: str, new_origin: int = INVENTED) -> Surface:

@@ -1,0 +1,199 @@
+"""A solid made hollow, with drains, and the proof that it drains.
+
+The cavity is the surface at wall depth inside; where the part is thinner than two walls it stays full. Each pocket of the cavity that
+keeps resin when the part stands along `up` gets a drain from its lowest place straight down through the wall, until nothing is kept;
+what is drilled out is returned as plugs, smaller by a clearance. The wall is measured afterwards, not assumed.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rangecheck.arrays import FloatArray
+from rangecheck.errors import SettingError, SurfaceError
+from rangecheck.solid.drainage import Pocket, pockets
+from rangecheck.solid.engine import from_engine, simplified, to_engine
+from rangecheck.solid.offset import inner_offset
+from rangecheck.solid.slices import frame_of
+from rangecheck.solid.solid import Solid
+from rangecheck.solid.thickness import sample_surface
+from rangecheck.surface import topology as topo
+from rangecheck.surface.distance import SurfaceDistance
+from rangecheck.surface.surface import INVENTED, Surface
+
+SIDES = 48
+#: how far a plug stays clear of its drain, all round
+CLEARANCE_MM = 0.1
+#: drilling stops after this many drains
+MOST_DRAINS = 12
+
+
+@dataclass(frozen=True)
+class Wall:
+    """The wall between cavity and outside, measured from the cavity: least, median and largest distance, and the share of the cavity's area
+    where it is within `tolerance_mm` of what was asked."""
+
+    asked_mm: float
+    least_mm: float
+    median_mm: float
+    largest_mm: float
+    tolerance_mm: float
+    share_within: float
+
+
+@dataclass(frozen=True)
+class Drain:
+    """A drilled hole: from inside the cavity to the outside, and its diameter."""
+
+    inside_mm: FloatArray
+    outside_mm: FloatArray
+    diameter_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class Hollow:
+    """solid, its plugs, the wall as measured, the drains, the pockets that still keep resin (empty: proved to drain), and what was saved."""
+
+    solid: Solid
+    plugs: tuple[Solid, ...]
+    wall: Wall
+    drains: tuple[Drain, ...]
+    kept: tuple[Pocket, ...]
+    cavity_mm3: float
+    notes: tuple[str, ...] = field(default=(), repr=False)
+
+
+def hollow(
+    solid: Solid,
+    *,
+    wall_mm: float,
+    up: npt.ArrayLike = (0.0, 1.0, 0.0),
+    drain_mm: float = 4.0,
+    step_mm: float | None = None,
+    tolerance_mm: float = 0.15,
+    least_pocket_mm3: float = 5.0,
+) -> Hollow:
+    """`solid` with a cavity `wall_mm` below its surface and drains of `drain_mm` diameter (0: none) for standing along `up`.
+
+    step_mm           grid of the cavity's surface; None means 0.4 walls
+    least_pocket_mm3  pockets below this do not count as resin kept
+    Raises SurfaceError when nothing lies deeper than the wall."""
+    if not (wall_mm > 0 and drain_mm >= 0):
+        raise SettingError(f"wall_mm is {wall_mm} and drain_mm {drain_mm}; lengths are needed", key="wall_mm")
+    inner = inner_offset(solid.surface, wall_mm, step_mm or 0.4 * wall_mm)
+    inner = _without_specks(inner, (drain_mm or wall_mm) ** 3) if inner is not None else None
+    if inner is None:
+        raise SurfaceError(
+            f"nothing lies {wall_mm:g} mm deep in the part, so a wall of {wall_mm:g} mm leaves no cavity; ask for a thinner wall",
+            wall_mm=wall_mm,
+        )
+    outer, outer_name = to_engine(solid.surface)
+    # the grid's many faces say no more than a few: collapsed within a small part of the tolerance
+    inner = simplified(inner, tolerance_mm / 10)
+    cavity, cavity_name = to_engine(inner)
+    sources = [(outer_name, solid.surface), (cavity_name, inner)]
+    made = outer - cavity
+    drains: list[Drain] = []
+    plugs: list[Solid] = []
+    surface = from_engine(made, sources, "drain")
+    kept = _kept(surface, solid, up, wall_mm, least_pocket_mm3)
+    while kept and drain_mm > 0 and len(drains) < MOST_DRAINS:
+        drain = _drain_for(kept[0], solid.surface, up, wall_mm, drain_mm)
+        made = made - _rod(drain, drain.diameter_mm / 2, wall_mm)
+        plugs += _plug(outer - cavity, drain, wall_mm)
+        drains.append(drain)
+        surface = from_engine(made, sources, "drain")
+        before = kept
+        kept = _kept(surface, solid, up, wall_mm, least_pocket_mm3)
+        if kept and np.allclose(kept[0].lowest_mm, before[0].lowest_mm) and kept[0].volume_mm3 >= 0.99 * before[0].volume_mm3:
+            break
+    volume = inner.volume_mm3
+    notes = (
+        f"hollowed to a wall of {wall_mm:g} mm: {volume / 1000:.2f} cm3 less resin",
+        f"{len(drains)} drains of {drain_mm:g} mm; "
+        + (f"{len(kept)} pockets keep {sum(p.volume_mm3 for p in kept):.1f} mm3" if kept else "every pocket drains"),
+    )
+    proved = Solid.from_surface(surface, notes=(*solid.notes, *notes))
+    return Hollow(
+        proved,
+        tuple(plugs),
+        measured_wall(solid.surface, inner, wall_mm, tolerance_mm),
+        tuple(drains),
+        tuple(kept),
+        volume,
+        notes,
+    )
+
+
+def _without_specks(inner: Surface, least_mm3: float) -> Surface | None:
+    """The cavity without bubbles too small to drain; a bubble within full material is better left full."""
+    from rangecheck.solid.containment import shell_volumes_mm3
+
+    count, shell = topo.shells(inner)
+    large = shell_volumes_mm3(inner, count, shell) >= least_mm3
+    # shells that face inwards are islands of material around which the cavity runs: they go with the body that they lie in
+    islands = shell_volumes_mm3(inner, count, shell) < 0
+    keep = large | islands
+    return inner.with_faces(np.flatnonzero(keep[shell])) if large.any() else None
+
+
+def measured_wall(outer: Surface, inner: Surface, asked_mm: float, tolerance_mm: float) -> Wall:
+    """The wall between an outer surface and a cavity, over the cavity's area."""
+    samples = sample_surface(inner, max(asked_mm, inner.extent_mm / 200))
+    distance, _ = SurfaceDistance(outer).distance_mm(samples.places_mm)
+    order = np.argsort(distance, kind="stable")
+    cumulated = np.cumsum(samples.area_mm2[order])
+    median = float(distance[order][np.searchsorted(cumulated, cumulated[-1] / 2)])
+    within = float(samples.area_mm2[np.abs(distance - asked_mm) <= tolerance_mm].sum() / cumulated[-1])
+    return Wall(asked_mm, float(distance.min()), median, float(distance.max()), tolerance_mm, within)
+
+
+def _kept(surface: Surface, solid: Solid, up: npt.ArrayLike, wall_mm: float, least_mm3: float) -> list[Pocket]:
+    """Pockets of the cavity that keep resin; hollows of the outside, which held water before, are not the cavity's."""
+    step = max(wall_mm / 3, float(np.ptp(surface.vertices, axis=0).max()) / 256)
+    found = pockets(surface, up, step_mm=step, least_mm3=least_mm3)
+    if not found:
+        return []
+    places = np.array([p.lowest_mm for p in found])
+    depth, _ = SurfaceDistance(solid.surface).signed_distance_mm(places)
+    return [p for p, d in zip(found, depth) if d < -wall_mm / 2]
+
+
+def _drain_for(pocket: Pocket, outer: Surface, up: npt.ArrayLike, wall_mm: float, drain_mm: float) -> Drain:
+    """From the pocket's lowest place straight down, or, where that way is longer than five walls, the shortest way out."""
+    from rangecheck.raycast import EmbreeCaster
+
+    down = -frame_of(up)[2]
+    inside = pocket.lowest_mm
+    hit = EmbreeCaster(outer.vertices, outer.faces).closest(inside[None], down[None])
+    if hit.face[0] >= 0 and hit.distance_mm[0] <= 5 * wall_mm:
+        return Drain(inside, inside + hit.distance_mm[0] * down, drain_mm)
+    nearest = SurfaceDistance(outer).nearest(inside[None])
+    return Drain(inside, nearest.place_mm[0], drain_mm)
+
+
+def _rod(drain: Drain, radius_mm: float, wall_mm: float) -> Any:
+    """A rod along the drain, half a wall longer inside and a whole wall outside."""
+    import manifold3d
+
+    way = drain.outside_mm - drain.inside_mm
+    length = float(np.linalg.norm(way))
+    frame = frame_of(way)
+    rod = manifold3d.Manifold.cylinder(length + 1.5 * wall_mm, radius_mm, radius_mm, SIDES)
+    start = drain.inside_mm - 0.5 * wall_mm * frame[2]
+    return rod.transform(np.column_stack([frame.T, start]))
+
+
+def _plug(wall: Any, drain: Drain, wall_mm: float) -> list[Solid]:
+    """What the drain takes out of the wall, smaller all round by the clearance: flush outside, and inside as the cavity is."""
+    radius = drain.diameter_mm / 2 - CLEARANCE_MM
+    if radius <= 0:
+        return []
+    cut = wall ^ _rod(drain, radius, wall_mm)
+    pieces = [p for p in cut.decompose() if p.volume() > 0.1 * math.pi * radius**2 * wall_mm]
+    return [Solid.from_surface(from_engine(p, [], "plug", INVENTED)) for p in pieces]

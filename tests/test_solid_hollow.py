@@ -1,0 +1,142 @@
+"""Hollow solids, simplified solids and deviations: volumes, walls and errors against closed forms."""
+
+import numpy as np
+import pytest
+from test_solid_repair import ball
+from test_topology import torus
+from test_topology_distance import cube
+
+from rangecheck.errors import SettingError, SurfaceError
+from rangecheck.solid import Solid, check_solid
+from rangecheck.solid.deviation import band_colours, both_ways, deviation, vertex_deviation_mm
+from rangecheck.solid.hollow import hollow
+from rangecheck.solid.offset import inner_offset
+from rangecheck.solid.printer import printer
+from rangecheck.solid.simplify import printable_error_mm, simplify
+from rangecheck.surface import INVENTED, MEASURED, Surface
+from rangecheck.surface import topology as topo
+
+Z = (0.0, 0.0, 1.0)
+
+
+@pytest.mark.parametrize("step", [0.5, 0.9])
+def test_the_offset_of_a_ball_is_a_ball_and_that_of_a_cube_a_cube(step):
+    inner = inner_offset(ball(96, 12.0), 3.0, step)
+    assert check_solid(inner).fit
+    radius = np.linalg.norm(inner.vertices, axis=1)
+    # the facets of the ball lie up to their sagitta inside it; interpolation over a step adds step^2 / 8 r
+    assert radius.max() <= 9.0 + step**2 / (8 * 9) and radius.min() >= 9.0 - 12 * (1 - np.cos(np.pi / 48)) - step**2 / 8
+    box = inner_offset(cube(10.0), 2.0, step)
+    assert box.volume_mm3 == pytest.approx(6.0**3, rel=6 * step**2 / 36) and np.abs(box.vertices).max() <= 3.0 + 1e-9
+
+
+def test_a_torus_keeps_its_hole_inside_and_what_is_too_thin_has_no_inside():
+    inner = inner_offset(torus(120, 80), 0.4, 0.15)
+    assert check_solid(inner).facts["genus"] == 1
+    assert inner.volume_mm3 == pytest.approx(2 * np.pi**2 * 3 * 0.6**2, rel=0.02)
+    assert inner_offset(torus(40, 30), 1.1, 0.2) is None
+    with pytest.raises(SurfaceError, match="choose a larger one"):
+        inner_offset(cube(), 0.1, 1e-5)
+
+
+def test_a_hollow_ball_has_its_wall_its_drain_and_is_proved_to_empty():
+    solid = Solid.from_surface(ball(96, 15.0))
+    made = hollow(solid, wall_mm=2.0, up=Z, drain_mm=4.0)
+    assert made.kept == () and len(made.drains) == 1
+    assert made.wall.share_within == pytest.approx(1.0) and abs(made.wall.median_mm - 2.0) < 0.05
+    cavity = 4 / 3 * np.pi * 13**3
+    assert made.cavity_mm3 == pytest.approx(cavity, rel=0.02)
+    drain = np.pi * 4.0 * 2.0
+    assert made.solid.volume_mm3 == pytest.approx(solid.volume_mm3 - made.cavity_mm3 - drain, abs=0.3 * drain)
+    assert made.drains[0].outside_mm[2] < -14 and topo.shells(made.solid.surface)[0] == 1
+    # the plug fills the drain but for its clearance
+    (plug,) = made.plugs
+    assert plug.volume_mm3 == pytest.approx(np.pi * 1.9**2 * 2.0, rel=0.1)
+
+
+def test_without_drains_the_pocket_is_named_with_its_volume():
+    made = hollow(Solid.from_surface(cube(20.0)), wall_mm=3.0, up=Z, drain_mm=0.0)
+    assert made.drains == () and len(made.kept) == 1 and made.kept[0].closed
+    assert made.kept[0].volume_mm3 == pytest.approx(14.0**3, rel=0.02) and "1 pockets keep" in made.notes[1]
+
+
+def test_two_chambers_get_two_drains():
+    # a dumb-bell: two boxes joined by a bar that is thinner than two walls
+    import manifold3d
+
+    bell = (
+        manifold3d.Manifold.cube((16, 16, 16))
+        + manifold3d.Manifold.cube((20, 3, 3)).translate((10, 6, 6))
+        + manifold3d.Manifold.cube((16, 16, 16)).translate((24, 0, 0))
+    )
+    mesh = bell.to_mesh64()
+    made = hollow(Solid.from_surface(Surface(mesh.vert_properties[:, :3], mesh.tri_verts.astype(int))), wall_mm=2.0, up=Z)
+    assert len(made.drains) == 2 and made.kept == () and len(made.plugs) == 2
+
+
+def test_labels_survive_hollowing():
+    outer = ball(48, 12.0)
+    origin = np.where(outer.triangles.mean(axis=1)[:, 2] > 0, MEASURED, INVENTED).astype(np.uint8)
+    made = hollow(
+        Solid.from_surface(Surface(outer.vertices, outer.faces, origin_of_face=origin)), wall_mm=2.0, up=Z
+    ).solid.surface
+    assert set(made.part_names) == {"surface", "cavity", "drain"}
+    cavity = made.part_of_face == made.part_names.index("cavity")
+    assert (made.origin_of_face[cavity] == INVENTED).all()
+    assert made.face_areas[made.origin_of_face == MEASURED].sum() == pytest.approx(outer.area_mm2 / 2, rel=0.03)
+
+
+def test_a_wall_that_leaves_no_room_is_refused():
+    with pytest.raises(SurfaceError, match="nothing lies 5 mm deep"):
+        hollow(Solid.from_surface(cube(8.0)), wall_mm=5.0)
+    with pytest.raises(SettingError, match="lengths are needed"):
+        hollow(Solid.from_surface(cube(8.0)), wall_mm=-1.0)
+
+
+@pytest.mark.parametrize("error", [0.02, 0.1])
+def test_simplification_keeps_its_promise_both_ways_and_keeps_labels_apart(error):
+    outer = ball(96, 20.0)
+    origin = np.where(outer.triangles.mean(axis=1)[:, 0] > 0, MEASURED, INVENTED).astype(np.uint8)
+    solid = Solid.from_surface(Surface(outer.vertices, outer.faces, origin_of_face=origin))
+    less = simplify(solid, error_mm=error)
+    assert less.error_mm <= error and less.faces_after < less.faces_before * 0.9
+    there, back = both_ways(solid.surface, less.solid.surface, spacing_mm=1.0)
+    assert max(np.abs(there.distance_mm).max(), np.abs(back.distance_mm).max()) <= error * 1.5
+    half = less.solid.surface.face_areas[less.solid.surface.origin_of_face == MEASURED].sum()
+    assert half == pytest.approx(outer.area_mm2 / 2, rel=0.01)
+
+
+def test_a_cube_needs_twelve_faces_and_the_printers_error_is_less_than_it_can_show():
+    inner = inner_offset(cube(10.0), 2.0, 0.5)
+    few = simplify(Solid.from_surface(inner), error_mm=0.3)
+    assert few.faces_after < few.faces_before / 10
+    assert printable_error_mm(printer("prusa-sl1s")) == pytest.approx(0.0125)
+    with pytest.raises(SettingError, match="a positive length"):
+        simplify(Solid.from_surface(cube()), error_mm=0.0)
+
+
+def test_deviation_of_concentric_balls_is_the_difference_of_their_radii_with_its_sign():
+    small, large = ball(96, 10.0), ball(96, 10.5)
+    inwards, outwards = both_ways(small, large, spacing_mm=0.7)
+    sagitta = 10.5 * (1 - np.cos(np.pi / 96) ** 2)
+    for d, sign in ((inwards, -1), (outwards, 1)):
+        numbers = d.statistics(0.4)["all"]
+        assert numbers["mean_mm"] == pytest.approx(sign * 0.5, abs=sagitta) and numbers["share_within"] == 0.0
+        assert numbers["rms_mm"] == pytest.approx(0.5, abs=sagitta)
+    assert outwards.histogram(np.array([0.0, 0.45, 0.55])).tolist() == pytest.approx([0, 0, 1, 0])
+    assert vertex_deviation_mm(large, small) == pytest.approx(0.5, abs=sagitta)
+
+
+def test_deviation_is_split_by_origin():
+    sheet = cube(10.0)
+    origin = np.where(sheet.face_normals[:, 2] > 0.5, INVENTED, MEASURED).astype(np.uint8)
+    raised = Surface(sheet.vertices * [1, 1, 1.2], sheet.faces, origin_of_face=origin)
+    numbers = deviation(raised, sheet, spacing_mm=1.0).statistics(0.1)
+    assert numbers["invented"]["mean_mm"] == pytest.approx(1.0) and numbers["invented"]["share_within"] == 0
+    assert numbers["measured"]["area_mm2"] + numbers["invented"]["area_mm2"] == pytest.approx(raised.area_mm2)
+
+
+def test_bands_are_white_within_and_red_or_blue_beyond():
+    colours = band_colours(np.array([0.0, 1.0, -1.0, 5.0]), 1.0)
+    assert colours[0].tolist() == [1, 1, 1] and colours[1, 0] > colours[1, 2] and colours[2, 2] > colours[2, 0]
+    assert np.array_equal(colours[1], colours[3]) and ((colours >= 0) & (colours <= 1)).all()
