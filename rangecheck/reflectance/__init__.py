@@ -1,14 +1,28 @@
 """How surfaces reflect: Lambert, the Beckmann-Spizzichino lobe and spike, masking, Fresnel, energy, sampling, materials."""
 
+from rangecheck.reflectance.brdf import (
+    KirchhoffWarning,
+    Scattering,
+    directional_albedo,
+    lobe_brdf,
+    sample_scattering,
+    spike_reflectance,
+)
 from rangecheck.reflectance.material import COLOUR_UM, GREY_UM, Material, load_material, material_names, stack_tables
 from rangecheck.reflectance.tables import MaterialTables
 
 __all__ = [
     "COLOUR_UM",
     "GREY_UM",
+    "KirchhoffWarning",
     "Material",
     "MaterialTables",
+    "Scattering",
+    "directional_albedo",
     "load_material",
+    "lobe_brdf",
     "material_names",
+    "sample_scattering",
+    "spike_reflectance",
     "stack_tables",
 ]

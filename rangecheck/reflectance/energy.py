@@ -13,7 +13,7 @@ solved for that very function, not for one that it approximates. At cos theta = 
 from __future__ import annotations
 
 import math
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import numpy as np
 
@@ -34,29 +34,36 @@ from rangecheck.reflectance.octaves import cell_and_share, node_count, nodes
 
 #: octaves of cos theta in the visibility table
 VISIBILITY_OCTAVES = 14
-#: share of the allowance 1 - e^-g that is left unused, so that the error of `lobe_fast` cannot carry the sum above 1
-ENERGY_MARGIN = 1e-4
+#: share of the allowance 1 - e^-g that is left unused, so that neither the error of `lobe_fast` nor that of the quadrature can carry
+#: the sum above 1; the second where masking or the bound bends sharply (V-grooves, rms slopes above 1)
+ENERGY_MARGIN, ENERGY_MARGIN_KINKED = 5e-5, 4e-4
 
-_CHECKS_PER_CELL = 4
-_GAUSS_X, _GAUSS_W = (np.ascontiguousarray(v) for v in np.polynomial.legendre.leggauss(8))
-_MAX_EDGES = 160
+_CHECKS_PER_CELL = 8
+_GAUSS_X, _GAUSS_W = (np.ascontiguousarray(v) for v in np.polynomial.legendre.leggauss(6))
+#: first panel in lobe widths, and growth of the panels in theta_r; halving both moves no albedo by more than 1e-6
+_FINEST, _GROWTH_POLAR = 0.7, 0.5
+_MAX_EDGES = 200
+_MOST_ROUNDS = 400
 
 
 @kernel
-def _polar_edges(theta_i, width, edges):
-    """Panels in theta_r: fine by `width` around the mirror direction and geometric towards both ends. Returns how many."""
+def _polar_edges(theta_i, width, kinks, edges):
+    """Panels in theta_r: fine by `width` around the mirror direction and geometric towards both ends. Returns how many.
+
+    `kinks` asks for narrower ones, where masking or the bound bends sharply between panels' edges."""
+    finest, growth, widest = (0.5 * _FINEST, 0.5 * _GROWTH_POLAR, 0.05) if kinks else (_FINEST, _GROWTH_POLAR, 2.0)
     half_pi = 0.5 * math.pi
     count = 0
-    step = 0.5 * width
+    step = finest * width
     at = 0.0
-    while count < 50 and (theta_i - at > 0.0 or theta_i + at < half_pi):
+    while count < _MAX_EDGES - 40 and (theta_i - at > 0.0 or theta_i + at < half_pi):
         for sign in (-1.0, 1.0):
             edge = theta_i + sign * at
             if 0.0 < edge < half_pi:
                 edges[count] = edge
                 count += 1
         at += step
-        step = max(step, 0.35 * at)
+        step = min(widest, max(step, growth * at))
     for k in range(26):
         edges[count] = half_pi - 0.5**k if k > 0 else half_pi
         count += 1
@@ -75,7 +82,8 @@ def gather_lobe(form, table, roughness, reach, masking, rms_slope, c_i, hats):
     s_i = math.sin(theta_i)
     reach_of_order = math.sqrt(max(1.0, 4.0 * roughness * c_i * c_i) / reach)
     edges = np.empty(_MAX_EDGES)
-    count = _polar_edges(theta_i, reach_of_order / (c_i + math.sqrt(reach_of_order)), edges)
+    kinks = masking == V_GROOVE or rms_slope > 1.0
+    count = _polar_edges(theta_i, reach_of_order / (c_i + math.sqrt(reach_of_order)), kinks, edges)
     own_masking = smith_masking(c_i, rms_slope) if masking == SMITH else 1.0
     for e in range(count - 1):
         half = 0.5 * (edges[e + 1] - edges[e])
@@ -89,7 +97,7 @@ def gather_lobe(form, table, roughness, reach, masking, rms_slope, c_i, hats):
             g = roughness * (c_i + c_r) * (c_i + c_r)
             arc = math.sqrt(max(1.0, g) / (reach * max(s_i * s_r, 1e-12)))
             around, largest, start = 0.0, 0.0, 0.0
-            stop = min(0.5 * arc, math.pi)
+            stop = min(_FINEST * arc, math.pi)
             while start < math.pi:
                 half_arc = 0.5 * (stop - start)
                 panel = 0.0
@@ -109,7 +117,7 @@ def gather_lobe(form, table, roughness, reach, masking, rms_slope, c_i, hats):
                 if panel * (math.pi - stop) < 1e-14 * around:
                     break
                 start = stop
-                stop = min(math.pi, stop + max(0.5 * arc, 0.7 * stop))
+                stop = min(math.pi, stop + max(_FINEST * arc, stop))
             share = 2.0 * around * c_r * s_r * half * _GAUSS_W[p]
             if masking == SMITH:
                 share *= own_masking * smith_masking(c_r, rms_slope)
@@ -160,14 +168,34 @@ def rms_slope_of(roughness: float, reach: float) -> float:
     return math.sqrt(roughness / reach) if reach > 0.0 else 0.0
 
 
+@cache
+def _check_points() -> tuple[FloatArray, FloatArray]:
+    """Cosines (checks,) at which the bound is held, _CHECKS_PER_CELL to a cell, and the matrix (checks, nodes - 1) that carries what is
+    smooth in the cosine from the nodes to them, by cubics through the four nodes around each."""
+    at = nodes(VISIBILITY_OCTAVES)[:-1]
+    check = np.arange((at.size - 1) * _CHECKS_PER_CELL + 1)
+    cosines = np.interp(check / _CHECKS_PER_CELL, np.arange(at.size), at)
+    first = np.clip(check // _CHECKS_PER_CELL - 1, 0, at.size - 4)
+    carry = np.zeros((check.size, at.size))
+    for j in range(4):
+        weight = np.ones(check.size)
+        for other in range(4):
+            if other != j:
+                weight *= (cosines - at[first + other]) / (at[first + j] - at[first + other])
+        carry[np.arange(check.size), first + j] = weight
+    return cosines, carry
+
+
 def _bounded(table: FloatArray, roughness: float, reach: float, pair_masking: int, rms_slope: float) -> FloatArray:
     """The largest visibility not above `table` that keeps lobe + spike within 1 at every check point."""
-    last = node_count(VISIBILITY_OCTAVES) - 2
-    check = np.arange(last * _CHECKS_PER_CELL + 1)
-    cosines = np.interp(check / _CHECKS_PER_CELL, np.arange(last + 1), nodes(VISIBILITY_OCTAVES)[:-1])
-    shares = lobe_shares(FAST, roughness, reach, pair_masking, rms_slope, cosines)
-    allowed = -np.expm1(-4.0 * roughness * cosines**2) * (1.0 - ENERGY_MARGIN)
+    cosines, carry = _check_points()
+    at = nodes(VISIBILITY_OCTAVES)[:-1]
+    # the lobe's albedo has a factor 1/cos of its own direction; without it, it is smooth enough to be carried
+    shares = carry @ (at[:, None] * lobe_shares(FAST, roughness, reach, pair_masking, rms_slope, at))
+    margin = ENERGY_MARGIN_KINKED if pair_masking == V_GROOVE or rms_slope > 1.0 else ENERGY_MARGIN
+    allowed = -np.expm1(-4.0 * roughness * cosines**2) * (1.0 - margin) * cosines
     # a node answers for the check points of the two cells beside it
+    check = np.arange(cosines.size)
     below, above = check // _CHECKS_PER_CELL, -(-check // _CHECKS_PER_CELL)
     limit = table.copy()
     limit[0] = 0.0
@@ -181,15 +209,14 @@ def _bounded(table: FloatArray, roughness: float, reach: float, pair_masking: in
         at_node[-1] = at_node[-2]
         return at_node
 
-    for _ in range(200):
-        now = excess()
-        grown = np.minimum(limit, bounded / np.sqrt(np.maximum(now, 1e-30)))
-        settled = np.abs(grown - bounded).max() < 1e-10
+    for _ in range(_MOST_ROUNDS):
+        grown = np.minimum(limit, bounded / np.sqrt(np.maximum(excess(), 1e-30)))
+        settled = np.abs(grown - bounded).max() < 1e-9
         bounded = grown
         if settled:
             break
     # from here on only downwards: less of any direction lowers the albedo of every other
-    for _ in range(200):
+    for _ in range(_MOST_ROUNDS):
         now = excess()
         if now.max() <= 1.0:
             break

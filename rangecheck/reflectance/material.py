@@ -117,7 +117,10 @@ class Material:
         count = len(self.wavelengths_um)
         rows = []
         for key in ("K_lm", "K_ss", "K_sl", "K_s"):
-            values = np.atleast_1d(np.asarray(getattr(self, key), dtype=np.float64))
+            try:
+                values = np.atleast_1d(np.asarray(getattr(self, key), dtype=np.float64))
+            except (TypeError, ValueError):
+                raise SceneError(f"{self.name}: {key} is {getattr(self, key)!r}; a strength is a number in 0..1") from None
             if values.shape not in ((1,), (count,)):
                 raise SceneError(f"{self.name}: {key} has {values.size} values for {count} wavelengths; give one or {count}")
             rows.append(np.broadcast_to(values, (count,)))
@@ -137,7 +140,7 @@ class Material:
             key: tuple(float(v) for v in np.interp(wavelengths_um, known, row[order]))
             for key, row in zip(("K_lm", "K_ss", "K_sl", "K_s"), self.strengths())
         }
-        return replace(self, wavelengths_um=tuple(float(w) for w in wavelengths_um), **moved)
+        return replace(self, wavelengths_um=tuple(float(w) for w in wavelengths_um), **moved)  # type: ignore[arg-type]
 
     def concerns(self) -> tuple[str, ...]:
         """Where the model is used outside its assumptions, in words; empty where it is not."""
@@ -205,13 +208,13 @@ def material_names() -> list[str]:
 
 
 def load_material(name_or_path: str | Path) -> Material:
-    """A shipped material by name, or one from a TOML file. Raises InputError naming the nearest shipped one, or the bad key."""
+    """A shipped material by name, or one from a TOML file. Raises InputError naming what ships, or the bad key."""
     path = Path(name_or_path)
     if path.suffix != ".toml":
         shipped = material_names()
         if str(name_or_path) not in shipped:
             raise InputError(
-                str(name_or_path), f"is no shipped material; choose one of {', '.join(shipped)}, or a .toml file", shipped=shipped
+                name_or_path, f"is no shipped material; choose one of {', '.join(shipped)}, or a .toml file", shipped=shipped
             )
         path = presets_folder() / "materials" / f"{name_or_path}.toml"
     try:
@@ -237,9 +240,9 @@ def _material_from(path: Path, document: dict[str, Any]) -> Material:
             values[key] = tuple(values[key])
     sources = [text for text in (values.get("source", ""), index.get("source", "")) if text]
     values["source"] = "; ".join(sources)
-    if index:
-        values.update(index_um=tuple(index["wavelengths_um"]), n=tuple(index["n"]), k=tuple(index["k"]))
     try:
+        if index:
+            values.update(index_um=tuple(index["wavelengths_um"]), n=tuple(index["n"]), k=tuple(index["k"]))
         return Material(name=path.stem, **values)
     except (TypeError, KeyError) as error:
         raise InputError(path, f"does not describe a material ({error})") from None
