@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from rangecheck.arrays import FloatArray, IntArray
-from rangecheck.solid.containment import shell_depths, shell_volumes_mm3
+from rangecheck.solid.containment import shell_depths, shell_sizes
 from rangecheck.solid.findings import Finding, finding
 from rangecheck.surface import intersections as meet
 from rangecheck.surface import topology as topo
@@ -126,14 +126,15 @@ def bodies(surface: Surface, closed: bool, severities: Severities = None) -> tup
     """Shells and, where all are closed, their roles: body, cavity, inside-out, nested; crumbs of noise. With facts about them."""
     count, shell = topo.shells(surface)
     euler = topo.euler_numbers(surface)
-    facts: dict[str, Any] = {"shells": count, "euler_number": int(euler.sum())}
+    facts: dict[str, Any] = {"shells": count, "euler_number": int(euler.sum()), "area_mm2": 0.0}
     found: list[Finding] = []
     if not count:
         return found, facts
-    areas: FloatArray = np.bincount(shell, surface.face_areas, minlength=count).astype(np.float64)
+    areas, volumes = shell_sizes(surface.vertices, surface.faces, shell, count)
+    facts["area_mm2"] = float(areas.sum())
     if not closed:
         return _crumbs(surface, shell, areas, "area", severities), facts
-    volumes = shell_volumes_mm3(surface, count, shell)
+    facts["volume_mm3"] = float(volumes.sum())
     depth = shell_depths(surface, count, shell)
     outside_in = (depth % 2 == 0) & (volumes < 0)
     nested = (depth % 2 == 1) & (volumes > 0)

@@ -46,18 +46,34 @@ def winding_numbers(surface: Surface, points_mm: FloatArray) -> FloatArray:
 
 
 def shell_volumes_mm3(surface: Surface, count: int, shell: IntArray) -> FloatArray:
-    """(count,) signed volume of each shell, each about its own middle; meaningful for closed shells."""
-    triangles = surface.triangles
-    weight = np.maximum(np.bincount(shell, minlength=count), 1)
-    middle = np.stack([np.bincount(shell, triangles[:, 0, axis], minlength=count) / weight for axis in range(3)], axis=1)
-    local = triangles - middle[shell][:, None, :]
-    six = np.einsum("ij,ij->i", local[:, 0], np.cross(local[:, 1], local[:, 2]))
-    return np.bincount(shell, six, minlength=count) / 6.0
+    """(count,) signed volume of each shell, meaningful for closed shells."""
+    return shell_sizes(surface.vertices, surface.faces, shell, count)[1]
+
+
+@kernel
+def shell_sizes(vertices, faces, shell, count):
+    """Area and signed volume of each shell, (count,) each; volumes about the shell's own first vertex, so that far from the origin no
+    digits are lost."""
+    area, volume = np.zeros(count), np.zeros(count)
+    about = np.full(count, -1, np.int32)
+    for f in range(len(faces)):
+        s = shell[f]
+        if about[s] < 0:
+            about[s] = faces[f, 0]
+        o, a, b, c = vertices[about[s]], vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
+        ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+        vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+        x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        area[s] += 0.5 * math.sqrt(x * x + y * y + z * z)
+        volume[s] += ((a[0] - o[0]) * x + (a[1] - o[1]) * y + (a[2] - o[2]) * z) / 6.0
+    return area, volume
 
 
 def shell_depths(surface: Surface, count: int, shell: IntArray) -> IntArray:
     """(count,) in how many other shells each closed shell lies. A shell is asked about by one point that touches no other shell's box
     face exactly, its first vertex; only shells whose box holds that point are looked at."""
+    if count < 2:
+        return np.zeros(count, np.int64)
     order = np.argsort(shell, kind="stable")
     start = np.searchsorted(shell[order], np.arange(count + 1))
     pieces = [surface.triangles[order[a:b]].reshape(-1, 9) for a, b in pairwise(start)]

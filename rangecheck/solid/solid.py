@@ -88,7 +88,6 @@ def check_solid(
         "faces": len(surface.faces),
         "closed": closed,
         "bounds_mm": [low.tolist(), high.tolist()],
-        "area_mm2": surface.area_mm2,
         "intersections_checked": intersections,
         "engine_asked": engine,
     }
@@ -98,9 +97,7 @@ def check_solid(
     about_bodies, body_facts = checks.bodies(surface, closed, severities)
     found += about_bodies
     facts |= body_facts
-    volume = surface.volume_mm3 if closed else 0.0
-    if closed:
-        facts["volume_mm3"] = volume
+    volume = facts.get("volume_mm3", 0.0)
     smallest = 1e-12 * surface.extent_mm**3
     if not len(surface.faces) or (closed and abs(volume) <= smallest):
         found.append(finding("no-volume", 1, f"it encloses {volume:.3g} mm3", severities=severities))
