@@ -8,6 +8,7 @@ from pathlib import Path
 from rangecheck.arrays import FloatArray
 from rangecheck.config import Settings
 from rangecheck.errors import NotSolid, OutputError
+from rangecheck.files import whole_file
 from rangecheck.pipeline.folder import check_free, check_writable
 from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.subject import eye_of, hashes, read_all_scans, read_subject, surface_of
@@ -150,6 +151,8 @@ def simulate(
     unit: str | None,
     views: int,
     noise_mm: float,
+    kind: str,
+    ambient: float,
     size: tuple[int, int],
     seed: int,
     force: bool,
@@ -173,7 +176,12 @@ def simulate(
     # the smaller field of view holds the sphere around the object
     distance = 1.05 * radius / np.sin(np.arctan(0.5 * min(size) / camera.fx))
     finder = RangeFinder(
-        source_mm=(distance / 4, 0.0, 0.0), working_distance_mm=distance, noise_mm=noise_mm, step_mm=noise_mm / 10
+        source_mm=(distance / 4, 0.0, 0.0),
+        working_distance_mm=distance,
+        noise_mm=noise_mm,
+        step_mm=noise_mm / 10,
+        kind=kind,
+        ambient=ambient,
     )
     caster = EmbreeCaster(surface.vertices, surface.faces)
     poses = ring_of_poses(views, distance, target_mm=0.5 * (low + high), elevations_deg=(-12.0, 38.0) if views > 1 else (10.0,))
@@ -185,9 +193,15 @@ def simulate(
     step = finder.step_mm or distance * 2 / 65535
     with reporter.stage("writing"):
         manifest = write_scans(Path(out), [one.scan for one in made], step_mm=step)
+        for one in made:
+            with whole_file(Path(out) / "truth" / f"{one.scan.name}.npz") as part, part.open("wb") as stream:
+                np.savez_compressed(
+                    stream, true_range_mm=one.true_range_mm, true_normal=one.true_normal, noise_mm=one.noise_mm, reason=one.reason
+                )
     valid = [int(one.scan.valid.sum()) for one in made]
     lines = [
-        f"{manifest}: {views} scans of {size[0]}x{size[1]}, {sum(valid):,} distances, noise {noise_mm:g} mm at {distance:.0f} mm"
+        f"{manifest}: {views} scans of {size[0]}x{size[1]}, {sum(valid):,} distances, {kind}, noise {noise_mm:g} mm at {distance:.0f} mm",
+        f"the truth of each, cell by cell, is in {Path(out) / 'truth'}",
     ]
     return Outcome(
         document(
