@@ -5,9 +5,20 @@ import math
 import numpy as np
 import pytest
 
-from rangecheck.errors import InputError, SceneError
+from rangecheck.errors import ArrayError, InputError, SceneError
 from rangecheck.kernels import kernel
-from rangecheck.reflectance import GREY_UM, Material, directional_albedo, load_material, lobe_brdf, material_names, stack_tables
+from rangecheck.reflectance import (
+    GREY_UM,
+    Material,
+    directional_albedo,
+    energy_table,
+    load_material,
+    lobe_brdf,
+    material_names,
+    polar_chart,
+    stack_tables,
+)
+from rangecheck.reflectance.charts import polar_components
 from rangecheck.reflectance.energy import visibility_of
 from rangecheck.reflectance.fast import FAST_ERROR
 from rangecheck.reflectance.fresnel import conductor_fresnel
@@ -167,3 +178,28 @@ def test_a_material_file_says_what_is_wrong_with_it(tmp_path):
         load_material(tmp_path / "absent.toml")
     path.write_text("K_lm = 0.5\n")
     assert load_material(path).name == "mine" and load_material(str(path)).K_lm == 0.5
+
+
+def test_the_energy_table_adds_up_and_shows_what_the_published_form_makes_of_nothing():
+    figure = load_material("figure_8")
+    rows = {row["degrees"]: row for row in energy_table(figure, (0.0, 60.0, 89.0))}
+    assert rows[89.0]["total"] <= 1 + 1e-6 < rows[89.0]["published"] == pytest.approx(1.245, abs=0.0005)
+    assert rows[60.0]["spike"] == pytest.approx(0.278, abs=0.0005) and rows[60.0]["lobe"] == pytest.approx(0.722, abs=0.003)
+    for row in rows.values():
+        assert row["diffuse"] + row["spike"] + row["lobe"] == pytest.approx(row["total"])
+    # Fresnel at normal incidence, on average over facets that all face nearly the same way
+    steel = energy_table(load_material("steel"), (0.0,))
+    assert [row["total"] for row in steel] == pytest.approx([0.667, 0.641, 0.603], abs=0.002)
+    assert [row["wavelength_um"] for row in steel] == [0.65, 0.55, 0.45]
+    assert {row["total"] for row in energy_table(load_material("plaster"), (0.0, 80.0))} == {0.9}
+
+
+def test_the_polar_plot_points_where_mirrors_do():
+    parts = polar_components(load_material("figure_8"), 45.0, 0.555)
+    assert parts["degrees"][np.argmax(parts["lobe"])] == pytest.approx(45, abs=2)
+    assert parts["spike"] == pytest.approx(math.exp(-((4 * math.pi * 0.1 / 0.555) ** 2) / 2), rel=1e-6)
+    assert (parts["diffuse"] == 0).all()
+    first, second = (polar_chart(load_material("steel_satin"), (45.0,)) for _ in range(2))
+    assert first == second and first.startswith(b"<?xml") and first.rstrip().endswith(b"</svg>")
+    with pytest.raises(ArrayError, match="view_degrees is 95"):
+        polar_chart(load_material("plaster"), (95.0,))

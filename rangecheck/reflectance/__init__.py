@@ -8,6 +8,7 @@ from rangecheck.reflectance.brdf import (
     sample_scattering,
     spike_reflectance,
 )
+from rangecheck.reflectance.charts import energy_table, polar_chart
 from rangecheck.reflectance.material import COLOUR_UM, GREY_UM, Material, load_material, material_names, stack_tables
 from rangecheck.reflectance.tables import MaterialTables
 
@@ -19,9 +20,11 @@ __all__ = [
     "MaterialTables",
     "Scattering",
     "directional_albedo",
+    "energy_table",
     "load_material",
     "lobe_brdf",
     "material_names",
+    "polar_chart",
     "sample_scattering",
     "spike_reflectance",
     "stack_tables",

@@ -17,19 +17,18 @@ import numpy.typing as npt
 from rangecheck.arrays import FloatArray, IntArray, require
 from rangecheck.errors import ArrayError
 from rangecheck.kernels import in_chunks, kernel
-from rangecheck.reflectance.energy import VISIBILITY_OCTAVES, lobe_shares, rms_slope_of, visibility_of, visibility_table
+from rangecheck.reflectance.energy import VISIBILITY_OCTAVES, lobe_albedo, rms_slope_of, visibility_table
 from rangecheck.reflectance.fast import lobe_fast, lobe_table
 from rangecheck.reflectance.lobe import (
     FAST,
     FORMS,
     MASKINGS,
-    SERIES,
     SMITH,
-    UNMASKED,
     V_GROOVE,
     lobe_geometry,
     scattering_sum,
     smith_masking,
+    two_numbers,
     v_groove_masking,
 )
 from rangecheck.reflectance.octaves import value_at
@@ -69,7 +68,7 @@ def lobe_brdf(
     form_number, masking_number = _choice("form", form, FORMS), _choice("masking", masking, MASKINGS)
     lengths = _lengths(sigma_um, correlation_um, wavelength_um)
     azimuth = require("phi", phi, finite=True)
-    arrays = np.broadcast_arrays(_polar("theta_i", theta_i), _polar("theta_r", theta_r), azimuth, *_two_numbers(*lengths))
+    arrays = np.broadcast_arrays(_polar("theta_i", theta_i), _polar("theta_r", theta_r), azimuth, *two_numbers(*lengths))
     shape = arrays[0].shape
     flat = [np.ascontiguousarray(a, dtype=np.float64).reshape(-1) for a in arrays]
     surface, seen = _visibilities(flat[3], flat[4], masking_number, bounded)
@@ -130,27 +129,14 @@ def directional_albedo(
     With `bounded` it is at most 1; without, the published model exceeds 1 past about 75 degrees. Errors and warnings as `lobe_brdf`."""
     number = _choice("masking", masking, MASKINGS)
     lengths = _lengths(sigma_um, correlation_um, wavelength_um)
-    angles, roughness, reach = np.broadcast_arrays(_polar("theta_i", theta_i), *_two_numbers(*lengths))
+    angles, roughness, reach = np.broadcast_arrays(_polar("theta_i", theta_i), *two_numbers(*lengths))
     cosines = np.cos(angles)
     spike = np.exp(-4.0 * roughness * cosines**2)
     lobe = np.zeros(angles.shape)
     for pair in {(float(a), float(b)) for a, b in zip(roughness.ravel(), reach.ravel())}:
         here = (roughness == pair[0]) & (reach == pair[1])
-        if pair[0] > 0.0:
-            lobe[here] = lobe_albedo(cosines[here], *pair, masking=number, bounded=bounded)
+        lobe[here] = lobe_albedo(cosines[here], *pair, masking=number, bounded=bounded)
     return spike + lobe
-
-
-def lobe_albedo(
-    cosines: FloatArray, roughness: float, reach: float, *, masking: int, bounded: bool, form: int = SERIES
-) -> FloatArray:
-    """(n,) share of the light from directions of `cosines` (n,) that the lobe alone gives out; numbers as in lobe.py."""
-    within = UNMASKED if bounded and masking == SMITH else masking
-    shares = lobe_shares(form, roughness, reach, within, rms_slope_of(roughness, reach), np.ascontiguousarray(cosines))
-    if not bounded:
-        return np.asarray(shares.sum(axis=1))
-    table = visibility_table(roughness, reach, masking, True)
-    return np.asarray(shares @ table * visibility_of(table, cosines))
 
 
 class Scattering(NamedTuple):
@@ -180,7 +166,7 @@ def sample_scattering(
     number = _choice("masking", masking, MASKINGS)
     lengths = [require(k, v, (), finite=True) for k, v in zip(("sigma_um", "correlation_um", "wavelength_um"),
                                                               (sigma_um, correlation_um, wavelength_um))]  # fmt: skip
-    roughness, reach = (float(v) for v in _two_numbers(*_lengths(*lengths)))
+    roughness, reach = (float(v) for v in two_numbers(*_lengths(*lengths)))
     c_i = math.cos(float(_polar("theta_i", require("theta_i", theta_i, ()))))
     uniform = np.random.default_rng(seed).random((int(n), 3))
     out = Scattering(np.zeros((int(n), 3)), np.zeros(int(n)), np.zeros(int(n), dtype=np.int64))
@@ -268,11 +254,6 @@ def _lengths(
             stacklevel=3,
         )
     return sigma, correlation, wave
-
-
-def _two_numbers(sigma: FloatArray, correlation: FloatArray, wave: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(roughness, reach) as lobe.py defines them."""
-    return np.asarray((2.0 * np.pi * sigma / wave) ** 2), np.asarray((np.pi * correlation / wave) ** 2)
 
 
 def _visibilities(roughness: FloatArray, reach: FloatArray, masking: int, bounded: bool) -> tuple[IntArray, FloatArray]:

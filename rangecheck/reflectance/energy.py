@@ -20,8 +20,10 @@ import numpy as np
 from rangecheck.arrays import FloatArray
 from rangecheck.kernels import in_chunks, kernel
 from rangecheck.reflectance.fast import lobe_fast, lobe_table
+from rangecheck.reflectance.fresnel import FRESNEL_OCTAVES
 from rangecheck.reflectance.lobe import (
     FAST,
+    SERIES,
     SMITH,
     UNMASKED,
     V_GROOVE,
@@ -30,7 +32,7 @@ from rangecheck.reflectance.lobe import (
     smith_masking,
     v_groove_masking,
 )
-from rangecheck.reflectance.octaves import cell_and_share, node_count, nodes
+from rangecheck.reflectance.octaves import cell_and_share, node_count, nodes, value_at
 
 #: octaves of cos theta in the visibility table
 VISIBILITY_OCTAVES = 14
@@ -74,10 +76,11 @@ def _polar_edges(theta_i, width, kinks, edges):
 
 
 @kernel
-def gather_lobe(form, table, roughness, reach, masking, rms_slope, c_i, hats):
+def gather_lobe(form, table, roughness, reach, masking, rms_slope, facets, c_i, hats):
     """hats[j] += integral over the hemisphere of f cos(theta_r) times the j-th tent of the visibility table; K = 1, unbounded.
 
-    The tents add up to 1, so that the sum of `hats` is the lobe's albedo. `masking` here is applied exactly, pair by pair."""
+    The tents add up to 1, so that the sum of `hats` is the lobe's albedo. `masking` here is applied exactly, pair by pair; `facets`
+    is a table of Fresnel's share (1, 1, nodes), or has a single node where nothing is absorbed."""
     theta_i = math.acos(c_i)
     s_i = math.sin(theta_i)
     reach_of_order = math.sqrt(max(1.0, 4.0 * roughness * c_i * c_i) / reach)
@@ -111,6 +114,9 @@ def gather_lobe(form, table, roughness, reach, masking, rms_slope, c_i, hats):
                     value *= lobe_geometry(reach, c_i, c_r, sxy2)
                     if masking == V_GROOVE:
                         value *= v_groove_masking(c_i, c_r, sxy2)
+                    if facets.size > 1:
+                        h2 = (c_i + c_r) * (c_i + c_r) + sxy2
+                        value *= value_at(facets, 0, 0, 0, 0.25 * h2, FRESNEL_OCTAVES)
                     panel += _GAUSS_W[q] * value
                 around += panel * half_arc
                 largest = max(largest, panel)
@@ -127,21 +133,48 @@ def gather_lobe(form, table, roughness, reach, masking, rms_slope, c_i, hats):
 
 
 @kernel
-def _gather_many(form, table, roughness, reach, masking, rms_slope, cosines, start, stop, out):
+def _gather_many(form, table, roughness, reach, masking, rms_slope, facets, cosines, start, stop, out):
     for i in range(start, stop):
-        gather_lobe(form, table, roughness, reach, masking, rms_slope, cosines[i], out[i])
+        gather_lobe(form, table, roughness, reach, masking, rms_slope, facets, cosines[i], out[i])
 
 
-def lobe_shares(form: int, roughness: float, reach: float, masking: int, rms_slope: float, cosines: FloatArray) -> FloatArray:
-    """(n, nodes) the lobe's albedo at each of `cosines`, divided among the tents of the visibility table."""
+def lobe_shares(
+    form: int, roughness: float, reach: float, masking: int, cosines: FloatArray, fresnel: FloatArray | None = None
+) -> FloatArray:
+    """(n, nodes) the lobe's albedo at each of `cosines`, divided among the tents of the visibility table; numbers as in lobe.py.
+
+    `fresnel` is a table of `fresnel.fresnel_table`, if facets absorb."""
     out = np.zeros((len(cosines), node_count(VISIBILITY_OCTAVES)))
     table = lobe_table()
+    facets = np.ones((1, 1, 1)) if fresnel is None else np.ascontiguousarray(fresnel).reshape(1, 1, -1)
+    rms_slope = rms_slope_of(roughness, reach)
 
     def work(start: int, stop: int) -> None:
-        _gather_many(form, table, roughness, reach, masking, rms_slope, cosines, start, stop, out)
+        _gather_many(form, table, roughness, reach, masking, rms_slope, facets, cosines, start, stop, out)
 
     in_chunks(work, len(cosines), 16)
     return out
+
+
+def lobe_albedo(
+    cosines: FloatArray,
+    roughness: float,
+    reach: float,
+    *,
+    masking: int,
+    bounded: bool,
+    form: int = SERIES,
+    fresnel: FloatArray | None = None,
+) -> FloatArray:
+    """(n,) share of the light from directions of `cosines` (n,) that the lobe alone gives out; numbers as in lobe.py."""
+    if roughness == 0.0:
+        return np.zeros(len(cosines))
+    within = UNMASKED if bounded and masking == SMITH else masking
+    shares = lobe_shares(form, roughness, reach, within, np.ascontiguousarray(cosines), fresnel)
+    if not bounded:
+        return np.asarray(shares.sum(axis=1))
+    table = visibility_table(roughness, reach, masking, True)
+    return np.asarray(shares @ table * visibility_of(table, cosines))
 
 
 def visibility_of(table: FloatArray, cosines: FloatArray) -> FloatArray:
@@ -191,7 +224,7 @@ def _bounded(table: FloatArray, roughness: float, reach: float, pair_masking: in
     cosines, carry = _check_points()
     at = nodes(VISIBILITY_OCTAVES)[:-1]
     # the lobe's albedo has a factor 1/cos of its own direction; without it, it is smooth enough to be carried
-    shares = carry @ (at[:, None] * lobe_shares(FAST, roughness, reach, pair_masking, rms_slope, at))
+    shares = carry @ (at[:, None] * lobe_shares(FAST, roughness, reach, pair_masking, at))
     margin = ENERGY_MARGIN_KINKED if pair_masking == V_GROOVE or rms_slope > 1.0 else ENERGY_MARGIN
     allowed = -np.expm1(-4.0 * roughness * cosines**2) * (1.0 - margin) * cosines
     # a node answers for the check points of the two cells beside it

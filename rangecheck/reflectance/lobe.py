@@ -20,6 +20,7 @@ al. 2007; V-grooves: Torrance & Sparrow 1967.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from rangecheck.kernels import inline_kernel, kernel
 from rangecheck.reflectance.series import lobe_rough, lobe_series, lobe_smooth
@@ -28,6 +29,11 @@ SERIES, SMOOTH, ROUGH, FAST = 0, 1, 2, 3
 FORMS = {"series": SERIES, "smooth": SMOOTH, "rough": ROUGH, "fast": FAST}
 UNMASKED, SMITH, V_GROOVE = 0, 1, 2
 MASKINGS = {"none": UNMASKED, "smith": SMITH, "v-groove": V_GROOVE}
+
+
+def two_numbers(sigma_um: Any, correlation_um: Any, wavelength_um: Any) -> tuple[Any, Any]:
+    """(roughness, reach) of a surface; arrays are as welcome as numbers."""
+    return (2.0 * math.pi * sigma_um / wavelength_um) ** 2, (math.pi * correlation_um / wavelength_um) ** 2
 
 
 @inline_kernel

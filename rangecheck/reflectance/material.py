@@ -26,7 +26,7 @@ from rangecheck.files import presets_folder, read_bytes
 from rangecheck.reflectance.energy import visibility_table
 from rangecheck.reflectance.fast import lobe_table
 from rangecheck.reflectance.fresnel import fresnel_table
-from rangecheck.reflectance.lobe import MASKINGS
+from rangecheck.reflectance.lobe import MASKINGS, two_numbers
 from rangecheck.reflectance.tables import (
     CORRELATION_UM,
     FRESNEL,
@@ -186,8 +186,7 @@ def stack_tables(materials: Sequence[Material]) -> MaterialTables:
         k_lm, k_ss, k_sl, k_s = material.strengths()
         masking = MASKINGS[material.masking]
         for w, wavelength in enumerate(waves):
-            roughness = (2.0 * math.pi * material.sigma_um / wavelength) ** 2
-            reach = (math.pi * material.correlation_um / wavelength) ** 2
+            roughness, reach = two_numbers(material.sigma_um, material.correlation_um, wavelength)
             lobe = k_sl[w] + k_s[w]
             row = surfaces[m, w]
             row[K_LM], row[K_SPIKE], row[K_LOBE] = k_lm[w], k_ss[w] + k_s[w], lobe
