@@ -23,6 +23,7 @@ COMMANDS = {
     "maps": "Distance, depth, normals and surface IDs from any focal point.",
     "turntable": "Frames and video of an orbit; resumes where it was stopped.",
     "simulate": "Make the scans that a range finder would have measured of a mesh.",
+    "decode": "Turn structured-light pictures into a range scan.",
     "draw": "Line drawing of a modelled scene, hidden lines removed.",
     "sample": "Make the sample scans again, byte for byte.",
     "materials": "List materials, plot their lobes, print their energy table.",

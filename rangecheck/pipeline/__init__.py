@@ -12,6 +12,7 @@ from rangecheck.pipeline.outcome import Outcome
 
 _WHERE = {
     "check": "inspect",
+    "decode": "captures",
     "doctor": "health",
     "draw": "views",
     "explain": "inspect",
