@@ -28,10 +28,14 @@ def first_of_each(bits, slots):
     mask = np.uint64(slots - 1)
     for i in range(len(bits)):
         x, y, z = bits[i, 0], bits[i, 1], bits[i, 2]
-        h = np.uint64(x) * np.uint64(0x9E3779B97F4A7C15)
-        h = ((h ^ (h >> np.uint64(29))) + np.uint64(y)) * np.uint64(0xBF58476D1CE4E5B9)
-        h = ((h ^ (h >> np.uint64(32))) + np.uint64(z)) * np.uint64(0x94D049BB133111EB)
-        place = (h ^ (h >> np.uint64(31))) & mask
+        # products of 32-bit numbers, which 64 bits hold
+        h = np.uint64(0)
+        for part in (x, y, z):
+            wide = np.uint64(part)
+            h = (h ^ wide ^ (wide >> np.uint64(32))) & np.uint64(0xFFFFFFFF)
+            h *= np.uint64(0x9E3779B1)
+            h ^= h >> np.uint64(29)
+        place = (h ^ (h >> np.uint64(17))) & mask
         while True:
             known = table[place]
             if known < 0:
