@@ -115,6 +115,27 @@ class Scene:
         """The same scene at other wavelengths; its lights must be grey or already have that many radiances."""
         return replace(self, materials=tuple(m.at(wavelengths_um) for m in self.materials))
 
+    def grey(self) -> Scene:
+        """At one wavelength, the middle one; what it shows is that wavelength's light."""
+        middle = self.channels // 2
+
+        def one(values: FloatArray) -> FloatArray:
+            return values[..., middle : middle + 1] if values.shape[-1] > 1 else values
+
+        sky = self.surroundings
+        return replace(
+            self,
+            materials=tuple(m.at(m.wavelengths_um[middle : middle + 1]) for m in self.materials),
+            sources=tuple(replace(source, radiance=one(source.radiance)) for source in self.sources),
+            surroundings=replace(
+                sky,
+                low=one(sky.low),
+                high=one(sky.high),
+                picture=None if sky.picture is None else one(sky.picture),
+                boxes=tuple(replace(box, radiance=one(box.radiance)) for box in sky.boxes),
+            ),
+        )
+
     def lit_by(self, sources: tuple[Source, ...], surroundings: Surroundings | None = None) -> Scene:
         """The same things under other light."""
         return replace(self, sources=sources, surroundings=self.surroundings if surroundings is None else surroundings)

@@ -85,4 +85,4 @@ def _light(surface: Surface, kind: str, axes: FloatArray) -> tuple[tuple[Source,
         box(0.6, 0, 80, 90, 50),
         box(0.8, 165, 25, 40, 90),
     )
-    return (lamp(0.06 * math.pi, -25, 45, 0.8),), room
+    return (lamp(0.06 * math.pi, -25, 45, 4.0),), room

@@ -1,7 +1,22 @@
-"""How light gets from the sources to the camera: the radiometric recursion, its stages, and the film."""
+"""How light gets from the sources to the camera: the radiometric recursion, its stages, the film, and the plan."""
 
+from rangecheck.transport.adaptive import render_to
 from rangecheck.transport.film import Film, image_irradiance
-from rangecheck.transport.settings import DIRECT, FULL, Settings
+from rangecheck.transport.plan import MODELS, TOLERANCE, Plan, make_plan, render
+from rangecheck.transport.settings import DIRECT, REPORT, Settings
 from rangecheck.transport.tracer import Tracer
 
-__all__ = ["DIRECT", "FULL", "Film", "Settings", "Tracer", "image_irradiance"]
+__all__ = [
+    "DIRECT",
+    "MODELS",
+    "REPORT",
+    "TOLERANCE",
+    "Film",
+    "Plan",
+    "Settings",
+    "Tracer",
+    "image_irradiance",
+    "make_plan",
+    "render",
+    "render_to",
+]

@@ -67,8 +67,8 @@ class PictureRays:
 
 
 @stage_kernel
-def start_rays(pixels, width, each, centre, seed, number, places, rays):
-    """Pixel coordinates places (2, n each) of group `number` of `each` samples of every pixel, and rays that together carry all the
+def start_rays(pixels, numbers, width, each, centre, seed, places, rays):
+    """Pixel coordinates places (2, n each) of group numbers[i] of `each` samples of pixel i, and rays that together carry all the
     light that they find. The samples of one group are spread evenly over the pixel; `centre` puts a single one in its middle."""
     k = np.int64(0)
     for i in range(len(pixels)):
@@ -78,12 +78,12 @@ def start_rays(pixels, width, each, centre, seed, number, places, rays):
         for j in range(each):
             places[0, k], places[1, k] = pixel - row * width, row
             if not centre:
-                x, y = point(key_of(stream, PIXEL), number * each + j)
+                x, y = point(key_of(stream, PIXEL), numbers[i] * each + j)
                 places[0, k] += x - 0.5
                 places[1, k] += y - 0.5
             rays.far[k] = math.inf
             rays.pixel[k] = i
-            rays.stream[k], rays.number[k] = stream, number * each + j
+            rays.stream[k], rays.number[k] = stream, numbers[i] * each + j
             rays.kind[k] = rays.first[k] = CAMERA
             for c in range(rays.weight.shape[1]):
                 rays.weight[k, c] = 1.0 / each

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -42,6 +42,14 @@ class Film:
     def standard_error(self) -> float:
         """Root mean square over the frame of each pixel's standard error, from `variance`; NaN when a pixel has a single sample."""
         return float(np.sqrt(self.variance.mean(dtype=np.float64)))
+
+    def in_channels(self, channels: int) -> Film:
+        """A grey film as one of `channels` equal wavelengths."""
+        if self.radiance.shape[2] == channels:
+            return self
+        shape = (*self.radiance.shape[:2], channels)
+        radiance, variance = (np.ascontiguousarray(np.broadcast_to(a, shape)) for a in (self.radiance, self.variance))
+        return replace(self, radiance=radiance, variance=variance, budget=self.budget * channels)
 
     def shares(self) -> dict[str, dict[str, float]]:
         """The light budget: share (0..1) of the frame's radiance by source, by number of reflections, by first reflection."""
@@ -85,6 +93,11 @@ class Plate:
         self.spread = np.zeros((n, channels), np.float32)
         self.covered = np.zeros(n, np.float32)
         self.count = np.zeros(n, np.int32)
+
+    def erase(self, pixels: IntArray) -> None:
+        """Forget what these pixels have seen."""
+        for array in (self.mean, self.spread, self.covered, self.count):
+            array[pixels] = 0
 
     def develop(self, budget: FloatArray, lights: tuple[str, ...], rays: IntArray | None = None) -> Film:
         """The film; `rays` per pixel where they differ from the observations."""

@@ -13,7 +13,7 @@ import numpy as np
 from rangecheck.kernels import inline_kernel, stage_kernel
 from rangecheck.scene.sources import form_factor
 from rangecheck.transport.chance import SHADOW, key_of, point
-from rangecheck.transport.queues import DIFFUSE, LOBE
+from rangecheck.transport.queues import DIFFUSE
 from rangecheck.transport.reflection import diffuse_of, lobe_of
 
 
@@ -129,8 +129,9 @@ def _aim_soft(
 
 
 @stage_kernel
-def add_light(shadows, n, reflections, sample, tally):
-    """Add what no surface blocks to `sample` and to the tally, as light that was reflected so many times."""
+def add_light(shadows, n, reflections, sample, tally, part):
+    """Add what no surface blocks to `sample` and to the tally, as light that was reflected so many times; what the
+    surface seen did not reflect diffusely counts as `part`."""
     for k in range(n):
         if shadows.blocked[k]:
             continue
@@ -142,6 +143,6 @@ def add_light(shadows, n, reflections, sample, tally):
         if reflections == 1:
             diffuse = light * shadows.diffuse_share[k]
             tally[DIFFUSE, 1, source] += diffuse
-            tally[LOBE, 1, source] += light - diffuse
+            tally[part, 1, source] += light - diffuse
         else:
             tally[shadows.first[k], reflections, source] += light

@@ -135,14 +135,53 @@ def _send_diffuse(materials, hits, i, share, least, number, rays, k):
 
 
 @stage_kernel
-def split(materials, hits, start, stop, with_spike, lobe_rays, diffuse_rays, least, rays):
-    """Rays for all three parts of hits start..stop; returns how many. Those that carry no more than `least` stay."""
+def _send_fan(materials, hits, i, rings, step, least, rays, k):
+    """Rings `step` apart around the mirror direction, 6 m rays in ring m, each weighted by its own solid angle (39); those below the
+    surface are dropped. Equation (38)."""
+    material = hits.material[i]
+    nx, ny, nz = float(hits.shading[i, 0]), float(hits.shading[i, 1]), float(hits.shading[i, 2])
+    vx, vy, vz = -float(hits.arriving[i, 0]), -float(hits.arriving[i, 1]), -float(hits.arriving[i, 2])
+    cosine = vx * nx + vy * ny + vz * nz
+    rx, ry, rz = mirror_ray(hits, i)
+    ax, ay, az, bx, by, bz = frame_around(rx, ry, rz)
+    sent = np.int64(0)
+    for ring in range(rings + 1):
+        count = max(1, 6 * ring)
+        inner = math.cos((ring - 0.5) * step) if ring > 0 else 1.0
+        solid_angle = 2.0 * math.pi * (inner - math.cos((ring + 0.5) * step)) / count
+        e, up = math.sin(ring * step), math.cos(ring * step)
+        for j in range(count):
+            turn = 2.0 * math.pi * j / count
+            p, q = e * math.cos(turn), e * math.sin(turn)
+            dx, dy, dz = p * ax + q * bx + up * rx, p * ay + q * by + up * ry, p * az + q * bz + up * rz
+            high = dx * nx + dy * ny + dz * nz
+            if high <= 0.0 or not _clear_of_face(hits, i, dx, dy, dz):
+                continue
+            toward = vx * dx + vy * dy + vz * dz
+            most = 0.0
+            at = k + sent
+            for c in range(rays.weight.shape[1]):
+                weight = hits.weight[i, c] * lobe_of(materials, material, c, high, cosine, toward) * high * solid_angle
+                rays.weight[at, c] = weight
+                most = max(most, weight)
+            if most > least:
+                _send(rays, at, hits, i, dx, dy, dz, LOBE, np.uint32(hits.number[i] + j))
+                sent += 1
+    return sent
+
+
+@stage_kernel
+def split(materials, hits, start, stop, with_spike, lobe_rays, fan_step, diffuse_rays, least, rays):
+    """Rays for all three parts of hits start..stop; returns how many. Those that carry no more than `least` stay. With fan_step > 0
+    the lobe is gathered by `lobe_rays` rings that many radians apart, else by so many rays drawn by scattering order."""
     k = np.int64(0)
     for i in range(start, stop):
         if materials.shiny[hits.material[i]]:
             if with_spike:
                 k += _send_spike(materials, hits, i, 1.0, least, rays, k)
-            for j in range(lobe_rays):
+            if fan_step > 0.0:
+                k += _send_fan(materials, hits, i, lobe_rays, fan_step, least, rays, k)
+            for j in range(0 if fan_step > 0.0 else lobe_rays):
                 k += _send_lobe(materials, hits, i, float(lobe_rays), least, hits.number[i] * lobe_rays + j, rays, k)
         for j in range(diffuse_rays):
             k += _send_diffuse(materials, hits, i, float(diffuse_rays), least, hits.number[i] * diffuse_rays + j, rays, k)

@@ -1,10 +1,13 @@
-"""What a picture is computed with. `plan` chooses these; `FULL` is the reference, `REPORT` the 1991 report's own approximations."""
+"""What a picture is computed with. `plan` chooses these; `REPORT` has the 1991 report's own approximations."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from rangecheck.errors import SettingError
+
+GLINTS = ("ray", "corners", "fraction")
+GATHERS = ("order", "fan")
 
 
 @dataclass(frozen=True)
@@ -21,6 +24,11 @@ class Settings:
     depth           reflections followed at most; 1 is light straight from the sources
     least           paths that carry no more than this share are not followed (0: all are)
     roulette_from   from this reflection on paths end by chance, without bias; 0: never
+    glints          sources in the mirror of the surface seen: `ray` those that the mirror ray meets, `corners` the report's
+                    four corner rays, `fraction` the exact share of the pixel's mirrored footprint
+    gather          over the lobe of the surface seen: `order` rays drawn by scattering order, `fan` the report's rings (39)
+                    made even and weighted by their solid angle, lobe_rays then being the number of rings
+    fan_step_deg    angle between rings
     backdrop        the camera itself sees the surroundings; else it sees darkness there
     """
 
@@ -36,6 +44,9 @@ class Settings:
     depth: int = 16
     least: float = 0.0
     roulette_from: int = 3
+    glints: str = "fraction"
+    gather: str = "order"
+    fan_step_deg: float = 5.0
     backdrop: bool = True
 
     def __post_init__(self) -> None:
@@ -51,9 +62,14 @@ class Settings:
         for name in ("lobe_rays", "diffuse_rays"):
             if not 0 <= getattr(self, name) <= 4096:
                 raise SettingError(f"{name} is {getattr(self, name)}; it must lie between 0 and 4096", key=name)
+        for name, known in (("glints", GLINTS), ("gather", GATHERS)):
+            if getattr(self, name) not in known:
+                raise SettingError(f"{name} is {getattr(self, name)!r}; there are {', '.join(known)}", key=name)
+        if not 0 < self.fan_step_deg <= 30:
+            raise SettingError(f"fan_step_deg is {self.fan_step_deg}; it must lie between 0 and 30 degrees", key="fan_step_deg")
         if not 0 <= self.least < 1:
             raise SettingError(f"least is {self.least}; it must be at least 0 and below 1", key="least")
 
 
 DIRECT = Settings(passes=1, centre=True, shadow_rays=0, spike=False, lobe=False, diffuse=False, depth=1)
-FULL = Settings(passes=64, shadow_rays=1, depth=64)
+REPORT = Settings(centre=True, shadow_rays=0, diffuse=False, depth=2, glints="corners", gather="fan", lobe_rays=6)

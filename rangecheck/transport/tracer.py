@@ -9,8 +9,10 @@ Every pixel's value depends on (scene, camera, settings, seed, pixel) alone, so 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import copy
 
 import numpy as np
 
@@ -23,9 +25,10 @@ from rangecheck.scene import Scene
 from rangecheck.transport.camera_rays import PictureRays, pixel_order, start_rays
 from rangecheck.transport.film import Film, Plate, expose
 from rangecheck.transport.geometry import geometry_of, sources_of
+from rangecheck.transport.glint import CELLS, aim_glints, corner_places, find_glints, glint_shares, mirrored_corners
 from rangecheck.transport.light import add_light, aim
 from rangecheck.transport.meet import meet
-from rangecheck.transport.queues import KIND_NAMES, Rays, Workspace
+from rangecheck.transport.queues import KIND_NAMES, LOBE, SPIKE, Hits, Rays, Shadows, Workspace
 from rangecheck.transport.reflection import materials_of
 from rangecheck.transport.scatter import choose_one, split
 from rangecheck.transport.settings import Settings
@@ -49,6 +52,16 @@ class Tracer:
         self.lights = (*(f"source {k}" for k in range(len(scene.sources))), "surroundings")
         self._idle: list[Workspace] = []
 
+    def grey(self) -> Tracer:
+        """The same scene at one wavelength only, for scenes whose wavelengths all look the same."""
+        twin = copy(self)
+        twin.scene = self.scene.grey()
+        twin.sources = sources_of(twin.scene, self.caster, 1)
+        twin.surroundings = twin.scene.surroundings.arrays(1)
+        twin.materials = materials_of(twin.scene.materials)
+        twin._idle = []
+        return twin
+
     def render(self, camera: Camera, world_from_camera: FloatArray, settings: Settings | None = None, *, seed: int = 0) -> Film:
         """The picture that `camera` takes from `world_from_camera` (4, 4), with the same bytes on any number of threads."""
         settings = settings or Settings()
@@ -57,7 +70,7 @@ class Tracer:
         pixels = pixel_order(camera.width, camera.height)
         tally = np.zeros((len(KIND_NAMES), settings.depth + 1, len(self.lights)))
         for number in range(settings.passes):
-            tally += self.expose(picture, pixels, settings, number, seed, plate)
+            tally += self.expose(picture, pixels, settings, seed, plate, number)
         rays = plate.count * np.int32(settings.each)
         return plate.develop(tally / (settings.passes * len(pixels)), self.lights, rays)
 
@@ -67,15 +80,50 @@ class Tracer:
         return PictureRays(camera, pose, self.caster.centre_mm, self.caster.scale_mm)
 
     def expose(
-        self, picture: PictureRays, pixels: IntArray, settings: Settings, number: int, seed: int, plate: Plate
+        self,
+        picture: PictureRays,
+        pixels: IntArray,
+        settings: Settings,
+        seed: int,
+        plate: Plate,
+        first: int | IntArray = 0,
+        count: int | IntArray = 1,
     ) -> FloatArray:
-        """Add sample `number` of the pixels to the plate; returns the tally (first reflection, reflections, light) of its light."""
+        """Add observations number first .. first + count - 1 of each of the pixels, none named twice, to the plate.
+
+        Returns the tally (first reflection, reflections, light) of their light."""
+        counts = np.broadcast_to(np.asarray(count, np.int64), len(pixels))
+        firsts = np.broadcast_to(np.asarray(first, np.int64), len(pixels))
+        ends = np.cumsum(counts)
+        # all observations of one pixel stay together, so that no two threads ever touch the same pixel
+        size = max(1, CHUNK // settings.each)
+        pieces = np.unique(np.searchsorted(ends, np.arange(0, ends[-1], size), side="right")) if len(ends) else np.zeros(1, int)
+        edges = np.append(pieces, len(pixels))
 
         def chunk(start: int, stop: int) -> FloatArray:
+            mine = slice(edges[start], edges[start + 1])
+            repeated = np.repeat(pixels[mine], counts[mine])
+            before = np.repeat(ends[mine] - counts[mine], counts[mine]) - (ends[mine.start] - counts[mine.start])
+            numbers = np.repeat(firsts[mine], counts[mine]) + np.arange(len(repeated)) - before
             with self._workspace() as work:
-                return _Chunk(self, settings, number, work).expose(picture, pixels[start:stop], seed, plate)
+                sample, face, tally = _Chunk(self, settings, work).shine(picture, repeated, numbers, seed)
+                expose(repeated, settings.each, sample, face, plate.mean, plate.spread, plate.covered, plate.count)
+            return tally
 
-        return np.sum(in_chunks(chunk, len(pixels), max(1, CHUNK // settings.each)), axis=0)
+        return np.sum(in_chunks(chunk, len(pieces), 1), axis=0)
+
+    def probe(self, picture: PictureRays, pixels: IntArray, settings: Settings, seed: int) -> FloatArray:
+        """(passes, n, c) float32: `settings.passes` observations of each of a few pixels."""
+        seen = np.empty((settings.passes, len(pixels), self.scene.channels), np.float32)
+
+        def chunk(start: int, stop: int) -> None:
+            with self._workspace() as work:
+                for number in range(settings.passes):
+                    numbers = np.full(stop - start, number, np.int64)
+                    seen[number, start:stop] = _Chunk(self, settings, work).shine(picture, pixels[start:stop], numbers, seed)[0]
+
+        in_chunks(chunk, len(pixels), max(1, CHUNK // (4 * settings.each)))
+        return seen
 
     @contextmanager
     def _workspace(self) -> Iterator[Workspace]:
@@ -90,36 +138,40 @@ class Tracer:
 class _Chunk:
     """One chunk's way through the stages, on one thread."""
 
-    def __init__(self, tracer: Tracer, settings: Settings, number: int, work: Workspace) -> None:
-        self._tracer, self._settings, self._number, self._work = tracer, settings, number, work
+    def __init__(self, tracer: Tracer, settings: Settings, work: Workspace) -> None:
+        self._tracer, self._settings, self._work = tracer, settings, work
         self._tally = np.zeros((len(KIND_NAMES), settings.depth + 1, len(tracer.lights)))
         self._sample = work.samples(0)
 
-    def expose(self, picture: PictureRays, pixels: IntArray, seed: int, plate: Plate) -> FloatArray:
+    def shine(
+        self, picture: PictureRays, pixels: IntArray, numbers: IntArray, seed: int
+    ) -> tuple[FloatArray, IntArray, FloatArray]:
+        """Observation numbers[i] of pixels[i]: radiance (n, c), face of each of its rays (n each,), and the tally; all three live until
+        the next call with this workspace."""
         each, centre = self._settings.each, self._settings.centre
         n = len(pixels) * each
         rays, places = self._work.rays(0, n), self._work.pixel_places(n)
         self._sample = self._work.samples(len(pixels))
-        start_rays(pixels, picture.camera.width, each, centre, seed & 0xFFFFFFFF, self._number, places, rays)
+        self._picture, self._pixels = picture, pixels
+        start_rays(pixels, numbers, picture.camera.width, each, centre, seed & 0xFFFFFFFF, places, rays)
         picture.fill(places[0], places[1], rays.origin, rays.direction)
         self._follow(rays, n, 0)
-        expose(pixels, each, self._sample, rays.face, plate.mean, plate.spread, plate.covered, plate.count)
-        return self._tally
+        return self._sample, rays.face[:n], self._tally
 
     def _follow(self, rays: Rays, n: int, reflections: int) -> None:
         """Cast n rays whose light has been reflected so many times on its way to the pixel, and all that follow from them."""
         tracer, settings = self._tracer, self._settings
-        tracer.caster.closest_local(
-            rays.origin[:n], rays.direction[:n], rays.far[:n], rays.face[:n], rays.u[:n], rays.v[:n], coherent=reflections == 0
-        )
+        self._cast(rays, n, coherent=reflections == 0)
         hits = self._work.hits(reflections, n)
         count = meet(
             tracer.geometry, tracer.sources, tracer.surroundings, rays, n, reflections,
-            settings.backdrop, True, hits, self._sample, self._tally,
+            settings.backdrop, reflections != 1 or settings.glints == "ray", hits, self._sample, self._tally,
         )  # fmt: skip
         if count == 0 or reflections == settings.depth:
             return
         self._light(hits, count, reflections + 1)
+        if reflections == 0 and settings.spike and settings.glints != "ray" and tracer.lights[1:]:
+            self._glints(hits, count)
         if not (settings.spike or settings.lobe or settings.diffuse):
             return
         branches = self._branches(reflections)
@@ -130,7 +182,17 @@ class _Chunk:
             if sent:
                 self._follow(self._work.rays(reflections + 1, 0), sent, reflections + 1)
 
-    def _light(self, hits, count: int, reflections: int) -> None:
+    def _cast(self, rays: Rays, n: int, *, coherent: bool) -> None:
+        self._tracer.caster.closest_local(
+            rays.origin[:n], rays.direction[:n], rays.far[:n], rays.face[:n], rays.u[:n], rays.v[:n], coherent=coherent
+        )
+
+    def _block(self, shadows: Shadows, n: int, *, coherent: bool) -> None:
+        self._tracer.caster.occluded_local(
+            shadows.origin[:n], shadows.direction[:n], shadows.far[:n], shadows.blocked[:n], coherent=coherent
+        )
+
+    def _light(self, hits: Hits, count: int, reflections: int) -> None:
         tracer, settings = self._tracer, self._settings
         each = len(tracer.sources.radius) * max(1, settings.shadow_rays)
         if each == 0:
@@ -141,26 +203,53 @@ class _Chunk:
             shadows = self._work.shadows((stop - start) * each)
             k = aim(tracer.sources, tracer.materials, hits, start, stop, settings.shadow_rays, True, True, shadows)
             if k:
-                tracer.caster.occluded_local(
-                    shadows.origin[:k], shadows.direction[:k], shadows.far[:k], shadows.blocked[:k], coherent=reflections == 1
-                )
-                add_light(shadows, k, reflections, self._sample, self._tally)
+                self._block(shadows, k, coherent=reflections == 1)
+                add_light(shadows, k, reflections, self._sample, self._tally, LOBE)
+
+    def _glints(self, hits: Hits, count: int) -> None:
+        """Sources that the surfaces seen mirror into their pixels."""
+        tracer, work, whole = self._tracer, self._work, self._settings.glints == "corners"
+        glint_hit = np.empty(count * len(tracer.sources.radius), np.int32)
+        glint_source = np.empty_like(glint_hit)
+        n = find_glints(tracer.materials, tracer.sources, hits, count, glint_hit, glint_source)
+        cells = 1 if whole else CELLS
+        each = (cells + 1) ** 2
+        step = max(1, _QUEUE // each)
+        for start in range(0, n, step):
+            hit, source = glint_hit[start : min(start + step, n)], glint_source[start : min(start + step, n)]
+            corners = len(hit) * each
+            rays, places = work.rays(1, corners), work.pixel_places(corners)
+            corner_places(self._pixels[hits.pixel[hit]], len(hit), self._picture.camera.width, cells, places)
+            self._picture.fill(places[0], places[1], rays.origin, rays.direction)
+            rays.far[:corners] = np.inf
+            self._cast(rays, corners, coherent=True)
+            directions, share = np.empty((corners, 3)), np.empty(len(hit))
+            mirrored_corners(tracer.geometry, rays, corners, work.hits(1, 1), directions)
+            quad = np.empty((4, 2))
+            glint_shares(tracer.sources, hits, hit, source, len(hit), cells, directions, whole, quad, share)
+            shadows = work.shadows(len(hit))
+            k = aim_glints(tracer.sources, tracer.materials, hits, hit, source, share, len(hit), shadows)
+            if k:
+                self._block(shadows, k, coherent=False)
+                add_light(shadows, k, 1, self._sample, self._tally, SPIKE)
 
     def _branches(self, reflections: int) -> int:
         settings = self._settings
         if reflections > 0:
             return 1
-        return max(1, int(settings.spike) + settings.lobe * settings.lobe_rays + settings.diffuse * settings.diffuse_rays)
+        rings = settings.lobe_rays
+        over_lobe = 1 + 3 * rings * (rings + 1) if settings.gather == "fan" else rings
+        return max(1, int(settings.spike) + settings.lobe * over_lobe + settings.diffuse * settings.diffuse_rays)
 
-    def _scatter(self, hits, start: int, stop: int, reflections: int) -> int:
+    def _scatter(self, hits: Hits, start: int, stop: int, reflections: int) -> int:
         tracer, settings = self._tracer, self._settings
         rays = self._work.rays(reflections + 1, (stop - start) * self._branches(reflections))
         if reflections == 0:
             return split(
                 tracer.materials, hits, start, stop, settings.spike, settings.lobe * settings.lobe_rays,
-                settings.diffuse * settings.diffuse_rays, settings.least, rays,
+                math.radians(settings.fan_step_deg) if settings.gather == "fan" else 0.0, settings.diffuse * settings.diffuse_rays, settings.least, rays,
             )  # fmt: skip
         roulette = 0 < settings.roulette_from <= reflections
         return choose_one(
-            tracer.materials, hits, start, stop, settings.spike, settings.lobe, settings.diffuse, roulette, settings.least, rays,
+            tracer.materials, hits, start, stop, settings.spike, settings.lobe, settings.diffuse, roulette, settings.least, rays
         )  # fmt: skip

@@ -1,0 +1,160 @@
+"""Samples where they are needed: one through every pixel's middle, then more at edges, highlights, penumbrae and noise, until the
+estimated error of the frame is small enough.
+
+The error of a frame is the root mean square over its pixels (and wavelengths) of the radiance's error, divided by the frame's mean
+radiance. What one sample may be off is judged by how its pixel departs from the straight line through its neighbours, in four directions;
+what a group of evenly spread samples may be off, by the spread of the groups, shared among neighbours. Samples are allotted in
+proportion to that spread (Neyman 1934), which gives the least error for their number.
+
+m groups of samples that are spread evenly together err less than m independent ones: their variance falls about as m^-1.5 at an edge and
+as m^-1 where noise has many dimensions. m^-1.25 is assumed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from rangecheck.arrays import FloatArray, IntArray
+from rangecheck.kernels import stage_kernel
+from rangecheck.optics import Camera
+from rangecheck.transport.camera_rays import PictureRays, pixel_order
+from rangecheck.transport.film import Film, Plate
+from rangecheck.transport.settings import Settings
+from rangecheck.transport.tracer import Tracer
+
+#: rays in one group; two groups are the least from which a spread can be told
+EACH = 4
+#: pixels whose first sample may be off by less than this share of the error asked for are left alone
+_QUIET = 0.1
+#: groups per pixel at most grow so much from one round to the next, because their number rests on an estimate
+_GROWTH = 4
+#: how the variance of a pixel falls with its number of groups
+_DECAY = 1.25
+
+
+def render_to(
+    tracer: Tracer,
+    camera: Camera,
+    world_from_camera: FloatArray,
+    settings: Settings,
+    error: float,
+    *,
+    seed: int = 0,
+    most: int = 4096,
+) -> Film:
+    """The picture with an estimated error of at most `error` (0.005: half a percent of the mean radiance), or as near to that as
+    `most` rays per pixel bring it. `settings.passes`, `each` and `centre` are chosen here. Same bytes on any number of threads."""
+    picture = tracer.picture_rays(camera, world_from_camera)
+    pixels = pixel_order(camera.width, camera.height)
+    plate = Plate(camera.height, camera.width, tracer.scene.channels)
+    tally = tracer.expose(picture, pixels, replace(settings, passes=1, each=1, centre=True), seed, plate)
+    rays = np.ones(len(pixels), np.int32)
+    _refine(tracer, picture, pixels, plate, rays, replace(settings, passes=1, each=EACH, centre=False), error, seed, most)
+    film = plate.develop(tally / len(pixels), tracer.lights, rays)
+    return film
+
+
+def _refine(
+    tracer: Tracer,
+    picture: PictureRays,
+    pixels: IntArray,
+    plate: Plate,
+    rays: IntArray,
+    settings: Settings,
+    error: float,
+    seed: int,
+    most: int,
+) -> None:
+    prior = np.empty(len(pixels), np.float32)
+    _unevenness(plate.mean, *plate.shape, prior)
+    groups, spread = np.zeros(len(pixels), np.int32), np.empty(len(pixels), np.float32)
+    while True:
+        mean = float(plate.mean.mean(dtype=np.float64))
+        allowed = (error * mean) ** 2
+        if not allowed > 0:
+            return
+        _group_variance(plate.spread, groups, prior, *plate.shape, spread)
+        wanted = _allot(prior, spread, groups, allowed, max(2, most // EACH))
+        more = pixels[(wanted > groups)[pixels]]
+        if not len(more):
+            return
+        fresh = more[groups[more] == 0]
+        plate.erase(fresh)
+        rays[fresh] = 0
+        tracer.expose(picture, more, settings, seed, plate, groups[more] + 1, wanted[more] - groups[more])
+        rays[more] += EACH * (wanted[more] - groups[more])
+        groups[more] = wanted[more]
+
+
+def _allot(prior: FloatArray, spread: FloatArray, groups: IntArray, allowed: float, most: int) -> IntArray:
+    """(n,) groups that every pixel should have, at least those it has, so that the mean squared error is `allowed`."""
+    wanted = groups.copy()
+    noisy = np.flatnonzero((groups > 0) | (prior > (_QUIET**2) * allowed))
+    if not len(noisy):
+        return wanted
+    quiet = float(prior.sum(dtype=np.float64) - prior[noisy].sum(dtype=np.float64))
+    left = allowed * len(prior) - quiet
+    single, now = prior[noisy].astype(np.float64), groups[noisy]
+    deviation = np.sqrt(np.maximum(spread[noisy], 0.0).astype(np.float64))
+    highest = np.minimum(most, np.maximum(2, _GROWTH * now))
+
+    def number(step: float) -> IntArray:
+        ideal = np.ceil(np.minimum((deviation / step) ** (2 / (1 + _DECAY)), float(most)))
+        # one group tells nothing of its spread, and a pixel that needs less than one keeps its single sample
+        ideal = np.where(ideal > 1, ideal, np.where((now == 0) & (single <= deviation * step), 0, 2))
+        return np.maximum(now, np.minimum(ideal, highest)).astype(np.int32)
+
+    def remains(count: IntArray) -> float:
+        return float(np.where(count > 0, spread[noisy] / np.maximum(count, 1.0) ** _DECAY, single).sum())
+
+    if remains(now) <= left:
+        return wanted
+    low, high = 1e-6 * np.sqrt(allowed), float(deviation.max()) + np.sqrt(single.max())
+    for _ in range(24):
+        middle = np.sqrt(low * high)
+        low, high = (middle, high) if remains(number(middle)) <= left else (low, middle)
+    wanted[noisy] = number(low)
+    return wanted
+
+
+@stage_kernel
+def _unevenness(mean, height, width, prior):
+    """Squared error that a pixel's single sample may have: a quarter of its largest squared second difference, mean over channels."""
+    channels = mean.shape[1]
+    for row in range(height):
+        for column in range(width):
+            worst = 0.0
+            for way in range(4):
+                dr, dc = (0, 1) if way == 0 else ((1, 0) if way == 1 else ((1, 1) if way == 2 else (1, -1)))
+                r0, r1 = max(row - dr, 0), min(row + dr, height - 1)
+                c0, c1 = min(max(column - dc, 0), width - 1), min(max(column + dc, 0), width - 1)
+                total = 0.0
+                for c in range(channels):
+                    here = mean[row * width + column, c]
+                    bend = mean[r0 * width + c0, c] + mean[r1 * width + c1, c] - 2.0 * here
+                    total += bend * bend
+                worst = max(worst, total / channels)
+            prior[row * width + column] = 0.25 * worst
+
+
+@stage_kernel
+def _group_variance(spread, groups, prior, height, width, variance):
+    """Variance of one group's mean: pooled over the pixel and its eight neighbours, with the first guess as one more voice."""
+    channels = spread.shape[1]
+    for row in range(height):
+        for column in range(width):
+            pixel = row * width + column
+            # four rays spread evenly over an edge are off by an eighth of what one is
+            total, voices = 0.125 * prior[pixel], 1.0
+            if groups[pixel] > 1:
+                for r in range(max(row - 1, 0), min(row + 2, height)):
+                    for c in range(max(column - 1, 0), min(column + 2, width)):
+                        near = r * width + c
+                        if groups[near] > 1:
+                            share = 4.0 if near == pixel else 1.0
+                            for k in range(channels):
+                                total += share * spread[near, k] / channels
+                            voices += share * (groups[near] - 1)
+            variance[pixel] = total / voices

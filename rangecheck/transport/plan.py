@@ -1,0 +1,309 @@
+"""The plan: model no more than a scene needs.
+
+For a tolerance, relative to the frame's mean radiance, the planner finds what may be left out: every decision rests on a bound or on
+a pilot, a measurement on a few hundred pixels of the very picture, and says so. The error of leaving something out is the root
+mean square over the pilot's pixels of the difference that it makes, measured twice with independent chance: the mean of the product
+of the two differences is free of their noise. Twice its standard error is added.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from rangecheck.arrays import FloatArray, IntArray
+from rangecheck.errors import SettingError
+from rangecheck.optics import Camera
+from rangecheck.reflectance.fast import FAST_ERROR
+from rangecheck.scene import Scene
+from rangecheck.transport.adaptive import render_to
+from rangecheck.transport.camera_rays import PictureRays, pixel_order
+from rangecheck.transport.film import Film
+from rangecheck.transport.settings import REPORT, Settings
+from rangecheck.transport.tracer import Tracer
+
+#: default tolerance: half a percent of the frame's mean radiance
+TOLERANCE = 0.005
+MODELS = ("plan", "full", "report")
+
+#: share of the tolerance that one thing left out may cost, and that all together may
+_EACH_SHARE, _ALL_SHARE = 0.2, 0.5
+#: the estimate of the remaining noise is asked to stay this far below what is left
+_NOISE_SHARE = 0.8
+_PILOT_PIXELS, _PILOT_PASSES = 1024, 8
+_DEPTHS = (1, 2, 3, 4, 6, 10, 16)
+_FULL_DEPTH = 64
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a picture will be computed with, and why.
+
+    settings  the light that is followed
+    error     what the noise of the picture may be, relative to its mean radiance; None: settings.passes says how many samples
+    grey      computed at one wavelength, and given to all
+    reasons   one line per decision
+    """
+
+    model: str
+    tolerance: float
+    settings: Settings
+    error: float | None
+    grey: bool = False
+    reasons: tuple[str, ...] = field(default=(), repr=False)
+
+    def explain(self) -> list[str]:
+        """The decisions, one line each, for people."""
+        return [f"model {self.model}, tolerance {100 * self.tolerance:g} % of the mean radiance", *self.reasons]
+
+
+def full_settings(tracer: Tracer) -> Settings:
+    """Everything that light does: the reference."""
+    return Settings(shadow_rays=1, depth=_FULL_DEPTH, each=4)
+
+
+def make_plan(
+    tracer: Tracer,
+    camera: Camera,
+    world_from_camera: FloatArray,
+    *,
+    tolerance: float = TOLERANCE,
+    model: str = "plan",
+    seed: int = 0,
+) -> Plan:
+    """How to take this picture within `tolerance`. A plan serves other views of the same scene as well: an orbit needs one.
+
+    model plan: as little as the tolerance allows; full: everything, at an error of a third of the tolerance; report: the 1991 report's
+    own approximations, whatever their error. Raises SettingError."""
+    if not 1e-5 <= tolerance <= 0.5:
+        raise SettingError(f"tolerance is {tolerance}; it must lie between 0.00001 and 0.5 of the mean radiance", key="tolerance")
+    if model not in MODELS:
+        raise SettingError(f"model is {model!r}; there are {', '.join(MODELS)}", key="model")
+    if model == "report":
+        return Plan(model, tolerance, REPORT, None, reasons=_REPORT_REASONS)
+    if model == "full":
+        reason = f"everything is traced, {_FULL_DEPTH} reflections deep, until the noise is a third of the tolerance"
+        return Plan(model, tolerance, full_settings(tracer), tolerance / 3, reasons=(reason,))
+    return _Planner(tracer, tracer.picture_rays(camera, world_from_camera), tolerance, seed).plan()
+
+
+def render(
+    tracer: Tracer,
+    camera: Camera,
+    world_from_camera: FloatArray,
+    *,
+    plan: Plan | None = None,
+    tolerance: float = TOLERANCE,
+    seed: int = 0,
+) -> Film:
+    """The picture by its plan (made here unless given). Same bytes on any number of threads."""
+    plan = plan or make_plan(tracer, camera, world_from_camera, tolerance=tolerance, seed=seed)
+    work = tracer.grey() if plan.grey else tracer
+    if plan.error is None:
+        film = work.render(camera, world_from_camera, plan.settings, seed=seed)
+    elif plan.model == "full":
+        film = render_evenly(work, camera, world_from_camera, plan.settings, plan.error, seed=seed)
+    else:
+        film = render_to(work, camera, world_from_camera, plan.settings, plan.error, seed=seed)
+    return film.in_channels(tracer.scene.channels) if plan.grey else film
+
+
+def render_evenly(
+    tracer: Tracer,
+    camera: Camera,
+    world_from_camera: FloatArray,
+    settings: Settings,
+    error: float,
+    *,
+    seed: int = 0,
+    most: int = 4096,
+) -> Film:
+    """The same number of samples in every pixel, as many as bring the frame's standard error to `error` of its mean."""
+    passes = 4
+    while True:
+        film = tracer.render(camera, world_from_camera, replace(settings, passes=passes), seed=seed)
+        mean = film.mean_radiance
+        if not mean > 0 or passes * settings.each >= most:
+            return film
+        ratio = film.standard_error() / (error * mean)
+        if ratio <= 1:
+            return film
+        passes = min(max(2 * passes, math.ceil(passes * min(ratio * ratio, 16.0))), max(1, most // settings.each))
+
+
+_REPORT_REASONS = (
+    "one ray through the middle of each pixel; sources seen in the mirror are looked for with the four corner rays",
+    "shadows: one ray to the middle of each source",
+    "lobe: the rings of (39), even and weighted by their solid angle, at the surface seen; there, light from sources only (26)",
+    "diffuse interreflection: none (44)",
+)
+
+
+class _Planner:
+    """One scene, one picture, one tolerance; collects reasons on the way."""
+
+    def __init__(self, tracer: Tracer, picture: PictureRays, tolerance: float, seed: int) -> None:
+        self.tracer, self.picture, self.tolerance, self.seed = tracer, picture, tolerance, seed
+        order = pixel_order(picture.camera.width, picture.camera.height)
+        # blocks of 4 x 4 pixels here and there: spread over the picture, yet coherent
+        blocks = max(1, len(order) // 16)
+        chosen = np.unique(np.linspace(0, blocks - 1, min(blocks, _PILOT_PIXELS // 16)).astype(int))
+        self.pixels: IntArray = (
+            np.ascontiguousarray((order[: blocks * 16].reshape(blocks, 16)[chosen]).ravel()) if len(order) >= 16 else order
+        )
+        self.reasons: list[str] = []
+        self.spent = 0.0
+        self.settings = full_settings(tracer)
+        self.seen: tuple[FloatArray, FloatArray] = self._look(self.settings)
+        self.mean = max(float(np.mean([half.mean(dtype=np.float64) for half in self.seen])), 0.0)
+
+    def plan(self) -> Plan:
+        if not self.mean > 0:
+            self.reasons.append("the pilot saw no light at all: one sample per pixel, light straight from the sources")
+            settings = Settings(spike=False, lobe=False, diffuse=False, depth=1)
+            return Plan("plan", self.tolerance, settings, self.tolerance, reasons=tuple(self.reasons))
+        self._shadows()
+        self._reflections()
+        self._depth()
+        self._branches()
+        self._lobe_form()
+        grey = self._grey()
+        left = math.sqrt(self.tolerance**2 - self.spent**2)
+        error = _NOISE_SHARE * left
+        self.reasons.append(
+            f"samples: one through each pixel's middle, more at edges, highlights, penumbrae and noise until the estimated error is {_percent(error)}"
+        )
+        return Plan("plan", self.tolerance, self.settings, error, grey, tuple(self.reasons))
+
+    def _look(self, settings: Settings) -> tuple[FloatArray, FloatArray]:
+        """(n, c) radiance of the pilot's pixels, twice, with independent chance."""
+        settings = replace(settings, passes=_PILOT_PASSES, each=1, centre=False)
+        first, second = (
+            self.tracer.probe(self.picture, self.pixels, settings, self.seed + 0x5EED + k).mean(axis=0, dtype=np.float64)
+            for k in (0, 1)
+        )
+        return first, second
+
+    def _cost(self, without: Settings) -> tuple[float, tuple[FloatArray, FloatArray]]:
+        """Relative error of these settings against the present ones, and what they see."""
+        seen = self._look(without)
+        product = ((seen[0] - self.seen[0]) * (seen[1] - self.seen[1])).mean(axis=1)
+        squared = float(product.mean()) + 2.0 * float(product.std()) / math.sqrt(len(product))
+        return math.sqrt(max(squared, 0.0)) / self.mean, seen
+
+    def _try(self, name: str, without: Settings, said: str) -> bool:
+        """Take `without` if it costs little enough."""
+        cost, seen = self._cost(without)
+        allowed = min(_EACH_SHARE * self.tolerance, _ALL_SHARE * self.tolerance - self.spent)
+        if cost <= allowed:
+            self.settings, self.seen = without, seen
+            self.spent += cost
+            self.reasons.append(
+                f"{name}: {said}; the pilot finds a difference of {_percent(cost)}, {_percent(allowed)} was allowed"
+            )
+            return True
+        self.reasons.append(
+            f"{name}: kept; without, the pilot finds an error of {_percent(cost)}, {_percent(allowed)} was allowed"
+        )
+        return False
+
+    def _shadows(self) -> None:
+        if not self.tracer.scene.sources:
+            self.settings = replace(self.settings, shadow_rays=0)
+            self.reasons.append("shadows: the scene has no sources")
+            return
+        self._try("soft shadows", replace(self.settings, shadow_rays=0), "one shadow ray to each source's middle")
+
+    def _reflections(self) -> None:
+        strengths = np.array([m.strengths().max(axis=1) for m in self.tracer.scene.materials])
+        diffuse, spike, lobe = (
+            strengths[:, 0].max(),
+            (strengths[:, 1] + strengths[:, 3]).max(),
+            (strengths[:, 2] + strengths[:, 3]).max(),
+        )
+        rough = max(m.sigma_um / max(m.wavelengths_um) for m in self.tracer.scene.materials)
+        for name, strength, key in (
+            ("mirroring (spike)", spike, "spike"),
+            ("gathering over the lobe", lobe, "lobe"),
+            ("diffuse interreflection", diffuse, "diffuse"),
+        ):
+            without = {
+                "spike": replace(self.settings, spike=False),
+                "lobe": replace(self.settings, lobe=False),
+                "diffuse": replace(self.settings, diffuse=False),
+            }[key]
+            if not strength > 0 or (key == "lobe" and rough == 0.0):
+                self.settings = without
+                self.reasons.append(f"{name}: no material has it")
+            else:
+                self._try(name, without, "left out")
+
+    def _depth(self) -> None:
+        if not (self.settings.spike or self.settings.lobe or self.settings.diffuse):
+            self.settings = replace(self.settings, depth=1)
+            self.reasons.append("depth: light straight from the sources is all there is")
+            return
+        for depth in _DEPTHS:
+            cost, seen = self._cost(replace(self.settings, depth=depth))
+            allowed = min(_EACH_SHARE * self.tolerance, _ALL_SHARE * self.tolerance - self.spent)
+            if cost <= allowed:
+                self.settings, self.seen = replace(self.settings, depth=depth), seen
+                self.spent += cost
+                self.reasons.append(
+                    f"depth: {depth} reflections; those beyond make a difference of {_percent(cost)}, {_percent(allowed)} was allowed"
+                )
+                return
+        self.reasons.append(f"depth: {_FULL_DEPTH} reflections; {_DEPTHS[-1]} would leave an error of {_percent(cost)}")
+
+    def _branches(self) -> None:
+        """How many rays gather at the surface seen: as many as pay, by the variance inside a pixel with one and with four."""
+        keys = [key for key in ("lobe", "diffuse") if getattr(self.settings, key)]
+        if not keys:
+            return
+
+        def variance(rays: int) -> float:
+            settings = replace(self.settings, passes=_PILOT_PASSES, each=1, lobe_rays=rays, diffuse_rays=rays)
+            seen = self.tracer.probe(self.picture, self.pixels, settings, self.seed + 77)
+            return float(seen.var(axis=0, dtype=np.float64).mean())
+
+        one, four = variance(1), variance(4)
+        gathered = max(0.0, (one - four) * 4 / 3)
+        rest = max(one - gathered, 1e-3 * one)
+        rays = int(np.clip(round(math.sqrt(gathered / rest)) if rest > 0 else 1, 1, 8))
+        self.settings = replace(self.settings, lobe_rays=rays, diffuse_rays=rays)
+        self.reasons.append(
+            f"gathering rays: {rays} at the surface seen, one further on; {100 * gathered / max(one, 1e-300):.0f} % of a sample's variance comes from gathering"
+        )
+
+    def _lobe_form(self) -> None:
+        if any(m.strengths()[1:].any() for m in self.tracer.scene.materials):
+            kind = "at the middle of each source" if self.settings.shadow_rays == 0 else "over each source's solid angle"
+            self.reasons.append(f"lobe: the fast form, within {_percent(FAST_ERROR)} of the series, {kind}")
+
+    def _grey(self) -> bool:
+        if self.tracer.scene.channels == 1:
+            return False
+        if _is_grey(self.tracer.scene):
+            self.reasons.append("colour: one wavelength; no material and no light tells wavelengths apart")
+            return True
+        spread = [half - half.mean(axis=1, keepdims=True) for half in self.seen]
+        product = (spread[0] * spread[1]).mean(axis=1)
+        cost = math.sqrt(max(float(product.mean()) + 2.0 * float(product.std()) / math.sqrt(len(product)), 0.0)) / self.mean
+        self.reasons.append(f"colour: {self.tracer.scene.channels} wavelengths; one would be off by {_percent(cost)}")
+        return False
+
+
+def _is_grey(scene: Scene) -> bool:
+    """Whether every wavelength must give the same picture: no lobes or spikes, whose form depends on it, and no colour."""
+    values = [source.radiance for source in scene.sources] + [scene.surroundings.low, scene.surroundings.high]
+    values += [box.radiance for box in scene.surroundings.boxes]
+    values += [m.strengths()[0] for m in scene.materials]
+    picture = scene.surroundings.picture
+    even = all(np.ptp(value) == 0 for value in values) and (picture is None or float(np.ptp(picture, axis=2).max()) == 0)
+    return even and not any(m.strengths()[1:].any() for m in scene.materials)
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.3g} %"
