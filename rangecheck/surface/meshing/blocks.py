@@ -11,12 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from rangecheck.arrays import BoolArray, FloatArray, IntArray
+from rangecheck.errors import SettingError
 from rangecheck.kernels import in_chunks, inline_kernel, kernel
 from rangecheck.surface.meshing.distance import BLOCK, CORNERS, SEEN
 
 #: corners between nodes of the coarse field
 COARSE = 4
 MISSING = -1
+#: a block index of 200 MB and a coarse field of 2 GB
+MOST_BLOCKS = 5e7
 
 
 @dataclass
@@ -39,10 +42,20 @@ class Grid:
 
 
 def box_for(samples_mm: FloatArray, step_mm: float) -> tuple[FloatArray, IntArray]:
-    """Origin (3,) and number of blocks (3,), even, of a box with two blocks of room around the samples."""
+    """Origin (3,) and number of blocks (3,), even, of a box with two blocks of room around the samples.
+
+    Raises SettingError when these would be more than MOST_BLOCKS."""
     low, high = samples_mm.min(axis=0), samples_mm.max(axis=0)
     edge = BLOCK * step_mm
-    count = np.ceil((high - low) / edge).astype(np.int64) + 4
+    wanted = np.ceil((high - low) / edge) + 4
+    if not np.prod(wanted) <= MOST_BLOCKS:
+        extent = " x ".join(f"{length:.4g}" for length in high - low)
+        raise SettingError(
+            f"a grid of {step_mm:.3g} mm over {extent} mm has {np.prod(wanted):.3g} blocks, and {MOST_BLOCKS:.0e} fit in memory; "
+            "raise voxel_mm, or remove samples that lie far away",
+            key="voxel_mm",
+        )
+    count = wanted.astype(np.int64)
     count += count % 2
     return 0.5 * (low + high) - 0.5 * count * edge, count
 

@@ -23,7 +23,7 @@ COARSE_REACH = 1.5
 
 
 @kernel
-def _nodes(kind, numbers, size, start, cells, origin, step, reach, first, last, field, state):
+def _nodes(kind, numbers, size, start, cells, free_weight, origin, step, reach, first, last, field, state):
     ny, nz = field.shape[1], field.shape[2]
     for i in range(first, last):
         for j in range(ny):
@@ -34,6 +34,7 @@ def _nodes(kind, numbers, size, start, cells, origin, step, reach, first, last, 
                     size,
                     start,
                     cells,
+                    free_weight,
                     origin[0] + i * step,
                     origin[1] + j * step,
                     origin[2] + k * step,
@@ -86,7 +87,9 @@ def coarse_field(views: Views, origin_mm: FloatArray, blocks: IntArray, step_mm:
     coarse_step = COARSE * step_mm
     reach = COARSE_REACH * coarse_step
     field, state = np.empty(shape, np.float32), np.empty(shape, np.uint8)
-    in_chunks(lambda i, j: _nodes(*views.arrays, origin_mm, coarse_step, reach, i, j, field, state), shape[0], 4)
+    in_chunks(
+        lambda i, j: _nodes(*views.arrays, views.typical_weight, origin_mm, coarse_step, reach, i, j, field, state), shape[0], 4
+    )
     for axis in range(3):
         for side in (0, -1):
             np.moveaxis(field, axis, 0)[side], np.moveaxis(state, axis, 0)[side] = reach, SEEN

@@ -26,11 +26,11 @@ JUMP_PITCHES = 2.0
 
 @inline_kernel
 def look(cells, start, height, width, u, v, r):
-    """(state, distance, weight, normal) of one view at a point that projects to u, v with range r.
+    """(state, distance, weight, normal, variance) of one view at a point that projects to u, v with range r.
 
     state: -1 nothing known, 0 free space reaches beyond every limit (the ray met nothing), 1 a surface at `distance` (signed)."""
     state = -1
-    distance = weight = nx = ny = nz = 0.0
+    distance = weight = nx = ny = nz = variance = 0.0
     if r > 0.0 and -0.5 < u < width - 0.5 and -0.5 < v < height - 0.5:
         c0, r0 = math.floor(u), math.floor(v)
         s, t = u - c0, v - r0
@@ -59,6 +59,7 @@ def look(cells, start, height, width, u, v, r):
                 ny += part * cells[cell, 5]
                 nz += part * cells[cell, 6]
                 cosine += part * cells[cell, 7]
+                variance += part * cells[cell, 8]
         if total > 0.999 or (total >= 0.5 and empty == 0.0):
             value /= total
             cosine /= total
@@ -74,22 +75,22 @@ def look(cells, start, height, width, u, v, r):
             state = 0
         elif total > 0.0 and total + empty > 0.999 and r < low - 1.0:
             state, distance, weight = 1, low - r, 0.0
-    return state, distance, weight, nx, ny, nz
+    return state, distance, weight, nx, ny, nz, variance
 
 
 @kernel
-def fuse_point(kind, numbers, size, start, cells, x, y, z, before_mm, behind_mm):
-    """State, distance, weight (0 where no view is near), and the soft distance: the nearest view's when none is within reach."""
-    total = weighted = 0.0
-    free = False
+def fuse_point(kind, numbers, size, start, cells, free_weight, x, y, z, before_mm, behind_mm):
+    """State, distance and weight. Behind the rim of what a view sees its tangent planes run on into empty space: what they call
+    inside is outside if the views that saw it empty outweigh them, each counting as a typical cell `before_mm` away."""
+    total = weighted = free = 0.0
     soft = -np.inf
     for s in range(len(kind)):
         u, v, r = project(kind[s], numbers[s], x, y, z)
-        state, d, w, _, _, _ = look(cells, start[s], size[s, 0], size[s, 1], u, v, r)
+        state, d, w, _, _, _, _ = look(cells, start[s], size[s, 0], size[s, 1], u, v, r)
         if state < 0:
             continue
         if state == 0 or d > before_mm:
-            free = True
+            free += free_weight
         elif d >= -behind_mm:
             if w > 0.0:
                 # behind the surface the weight falls: what lies there may be another side of something thin
@@ -98,15 +99,17 @@ def fuse_point(kind, numbers, size, start, cells, x, y, z, before_mm, behind_mm)
                 weighted += w * d
         else:
             soft = max(soft, d)
-    if total > 0.0:
+    if total > 0.0 and (weighted >= 0.0 or weighted + free * before_mm <= 0.0):
         return SEEN, weighted / total, total
-    if free:
+    if free > 0.0:
         return FREE, before_mm, 0.0
     return UNKNOWN, soft, 0.0
 
 
 @kernel
-def _fill_blocks(kind, numbers, size, start, cells, origins, step, before_mm, behind_mm, first, last, field, weight, state):
+def _fill_blocks(
+    kind, numbers, size, start, cells, free_weight, origins, step, before_mm, behind_mm, first, last, field, weight, state
+):
     for b in range(first, last):
         corner = 0
         for k in range(BLOCK):
@@ -115,7 +118,7 @@ def _fill_blocks(kind, numbers, size, start, cells, origins, step, before_mm, be
                 y = origins[b, 1] + j * step
                 for i in range(BLOCK):
                     x = origins[b, 0] + i * step
-                    what, d, w = fuse_point(kind, numbers, size, start, cells, x, y, z, before_mm, behind_mm)
+                    what, d, w = fuse_point(kind, numbers, size, start, cells, free_weight, x, y, z, before_mm, behind_mm)
                     field[b, corner], weight[b, corner], state[b, corner] = d, w, what
                     corner += 1
 
@@ -131,7 +134,11 @@ def fill_blocks(
     field, weight = np.empty((n, CORNERS), np.float32), np.empty((n, CORNERS), np.float32)
     state = np.empty((n, CORNERS), np.uint8)
     in_chunks(
-        lambda i, j: _fill_blocks(*views.arrays, origins_mm, step_mm, before_mm, behind_mm, i, j, field, weight, state), n, 64
+        lambda i, j: _fill_blocks(
+            *views.arrays, views.typical_weight, origins_mm, step_mm, before_mm, behind_mm, i, j, field, weight, state
+        ),
+        n,
+        64,
     )
     return field, weight, state
 
@@ -144,11 +151,11 @@ def _settle(kind, numbers, size, start, cells, points, normals, reach_mm, steps,
         gx, gy, gz = normals[i, 0], normals[i, 1], normals[i, 2]
         total = 0.0
         for _ in range(steps):
-            total = sum_d = mx = my = mz = 0.0
+            total = sum_d = sum_dd = noise = mx = my = mz = 0.0
             n = 0
             for s in range(len(kind)):
                 u, v, r = project(kind[s], numbers[s], x, y, z)
-                state, d, w, nx, ny, nz = look(cells, start[s], size[s, 0], size[s, 1], u, v, r)
+                state, d, w, nx, ny, nz, variance = look(cells, start[s], size[s, 0], size[s, 1], u, v, r)
                 if state != 1 or w <= 0.0 or abs(d) > reach_mm:
                     continue
                 length = math.sqrt(nx * nx + ny * ny + nz * nz)
@@ -156,9 +163,10 @@ def _settle(kind, numbers, size, start, cells, points, normals, reach_mm, steps,
                 if agree < 0.3:
                     continue
                 w *= agree
-                # a view farther off than its errors explain is another surface or a bad pose: it counts less (Cauchy)
                 total += w
                 sum_d += w * d
+                sum_dd += w * d * d
+                noise += w * w * variance
                 mx, my, mz = mx + w * nx / length, my + w * ny / length, mz + w * nz / length
                 n += 1
             if n == 0:
@@ -171,7 +179,10 @@ def _settle(kind, numbers, size, start, cells, points, normals, reach_mm, steps,
             z = min(max(z - d * gz, low[i, 2]), high[i, 2])
             looks[i] = n
         if total > 0.0:
-            error[i] = math.sqrt(1.0 / total)
+            # scatter of the views beyond their noise is error too: bad poses, or detail that the fits smooth away
+            mean = sum_d / total
+            scatter = max(sum_dd / total - mean * mean, 0.0) / n
+            error[i] = math.sqrt(noise / (total * total) + scatter)
             points[i, 0], points[i, 1], points[i, 2] = x, y, z
             normals[i, 0], normals[i, 1], normals[i, 2] = gx, gy, gz
 

@@ -18,21 +18,21 @@ from rangecheck.surface.meshing.blocks import Grid, add_blocks, box_for, grid_ne
 from rangecheck.surface.meshing.closing import coarse_field, fill_open, smooth_open
 from rangecheck.surface.meshing.distance import fill_blocks, settle
 from rangecheck.surface.meshing.extract import MARGIN, split_quads, zero_set
+from rangecheck.surface.meshing.labels import INVENTED_ERROR, thresholds
+from rangecheck.surface.meshing.openings import opened
 from rangecheck.surface.meshing.samples import distance_to_samples, label_faces, sample_grid
 from rangecheck.surface.meshing.shells import shell_of_vertex, shells_to_keep
 from rangecheck.surface.meshing.views import Views, views_of
 from rangecheck.surface.surface import MEASURED, Surface
 
 #: step of the grid in median sample spacings
-VOXEL_IN_SPACINGS = 1.25
+VOXEL_IN_SPACINGS = 1.0
 #: how far before and behind a surface its distance is used, in steps of the grid
 BEFORE_STEPS, BEHIND_STEPS = 2.5, 2.5
-#: default thresholds of the labels, in median sample spacings
-MEASURED_IN_SPACINGS, INTERPOLATED_IN_SPACINGS = 2.0, 6.0
 #: shells with less than this share of the largest shell's measured area are floating bits
 LEAST_SHELL = 0.02
-#: expected error of invented surface as a share of the distance to the nearest sample
-INVENTED_ERROR = 0.3
+#: error left by detail between the samples, as a share of their spacing: what makes the expected errors of scanned busts come true
+UNRESOLVED = 0.015
 OPEN_SWEEPS = 12
 
 
@@ -42,23 +42,24 @@ def fuse(
     voxel_mm: float | None = None,
     measured_mm: float | None = None,
     interpolated_mm: float | None = None,
+    closing: str = "closed",
+    largest_hole_mm: float | None = None,
     least_shell: float = LEAST_SHELL,
 ) -> Surface:
-    """One closed, outward-oriented 2-manifold from posed scans.
+    """One outward-oriented 2-manifold from posed scans, closed unless `closing` says otherwise.
 
     voxel_mm         step of the grid; by default VOXEL_IN_SPACINGS times the median distance between neighbouring samples
     measured_mm      a face with a sample this near to its centroid is measured (default 2 sample spacings)
     interpolated_mm  one with a sample this near is interpolated (default 6 spacings); the rest is invented
+    closing          closed; half: invented patches wider than `largest_hole_mm` are left open; open: all are
     least_shell      shells with less than this share of the largest shell's measured area are dropped
 
     Raises ScanError for scans without a surface or cameras that cannot be projected into, SettingError for a bad setting."""
-    for name, value in (("voxel_mm", voxel_mm), ("measured_mm", measured_mm), ("interpolated_mm", interpolated_mm)):
-        if value is not None and not (np.isfinite(value) and value > 0):
-            raise SettingError(f"{name} is {value}; it must be a positive number of millimetres", key=name)
+    if voxel_mm is not None and not (np.isfinite(voxel_mm) and voxel_mm > 0):
+        raise SettingError(f"voxel_mm is {voxel_mm}; it must be a positive number of millimetres", key="voxel_mm")
     views = views_of(scans)
     step = voxel_mm or VOXEL_IN_SPACINGS * views.spacing_mm
-    measured = measured_mm or MEASURED_IN_SPACINGS * views.spacing_mm
-    interpolated = max(interpolated_mm or INTERPOLATED_IN_SPACINGS * views.spacing_mm, measured)
+    measured, interpolated = thresholds(views.spacing_mm, measured_mm, interpolated_mm)
     grid, coarse = _grid_of_distances(views, step)
     points, normals, low, seen, quads = zero_set(grid, coarse)
     if len(quads) == 0:
@@ -70,8 +71,10 @@ def fuse(
     points, faces, origin, error = _without_floating_bits(points, faces, origin, error, least_shell)
     unseen = ~np.isfinite(error)
     reach = float(np.linalg.norm(np.ptp(points, axis=0)))
-    error[unseen] = INVENTED_ERROR * distance_to_samples(nearby, points[unseen], reach)
-    return Surface(points + views.shift_mm, faces, origin_of_face=origin, vertex_error_mm=error)
+    wide = sample_grid(views.samples_mm, interpolated)
+    error[unseen] = INVENTED_ERROR * distance_to_samples(wide, points[unseen], reach)
+    surface = Surface(points + views.shift_mm, faces, origin_of_face=origin, vertex_error_mm=error)
+    return opened(surface, closing, largest_hole_mm)
 
 
 def _grid_of_distances(views: Views, step: float) -> tuple[Grid, FloatArray]:
@@ -118,7 +121,8 @@ def _settle(views: Views, points: FloatArray, normals: FloatArray, low: FloatArr
     chosen = np.flatnonzero(seen)
     moved, directions = points[chosen], normals[chosen]
     box_low, box_high = low[chosen] + MARGIN * step, low[chosen] + (1 - MARGIN) * step
-    error[chosen], _ = settle(views, moved, directions, 1.5 * step, box_low, box_high)
+    noise, _ = settle(views, moved, directions, 1.5 * step, box_low, box_high)
+    error[chosen] = np.hypot(noise, UNRESOLVED * views.spacing_mm)
     points[chosen], normals[chosen] = moved, directions
     return error
 

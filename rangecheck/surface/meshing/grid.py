@@ -155,6 +155,14 @@ def grid_mesh(scan: RangeScan, *, max_angle_deg: float = 80.0, noise_mm: float |
     return Surface(rigid.move_points(scan.world_from_scan, points[used]), faces, vertex_error_mm=error)
 
 
+def estimated_noise_mm(scan: RangeScan) -> float | None:
+    """Standard deviation of range that the scan itself shows, over all obliquities; None when under 20 cells tell."""
+    rough = np.empty(scan.range_mm.shape)
+    _roughness(scan.range_mm.astype(np.float64), rough)
+    values = rough[np.isfinite(rough)]
+    return float(np.median(values)) / 0.6745 if len(values) >= 20 else None
+
+
 def _errors(
     scan: RangeScan, points: FloatArray, rays: FloatArray, faces: IntArray, used: FloatArray, noise: float | None
 ) -> FloatArray | None:

@@ -21,14 +21,18 @@ from rangecheck.kernels import in_chunks, inline_kernel, kernel
 
 #: standard deviations of the Gaussian windows in pixels, narrow to wide; each window reaches two of them
 WIDTHS_PX = (0.9, 1.3, 1.9, 2.7)
-#: half length of a confidence interval in standard errors
-CONFIDENCE = 1.6
+#: half length of a confidence interval in standard errors: short, since what noise is left is averaged over several scans
+CONFIDENCE = 0.7
 #: neighbours steeper than this against the plane across the ray belong to another surface
 STEEPEST_TAN = math.tan(math.radians(80.0))
 #: how far, in tangent of slope, the surface may bend within a window before a neighbour is taken for another surface
 BEND_TAN = 0.6
 #: edges of the obliquity classes of the noise estimate, cosine
 COSINE_CLASSES = np.array([0.0, 0.25, 0.4, 0.55, 0.7, 0.85, 1.0])
+#: the same where neighbours are missing
+EDGE_WIDTHS_PX = np.array([0.8])
+#: prior of the curvature at the edges: one standard deviation is a pitch / sqrt(RIDGE) per squared cell
+RIDGE = 2.0
 ROWS = 16
 Offsets = tuple[FloatArray | None, FloatArray | None]
 
@@ -104,9 +108,9 @@ def _planes(ranges, pitch, sigma, first, last, slope_u, slope_v, roughness):
 
 
 @kernel
-def _solve_spd(a, b, n):
-    """Cholesky solution of the n x n system a x = b, in place; False when a is not positive definite."""
-    for i in range(n):
+def _cholesky(a):
+    """Lower factor of the symmetric 6 x 6 matrix whose lower half is in `a`, in place; False when it is not positive definite."""
+    for i in range(6):
         for j in range(i + 1):
             s = a[i, j]
             for k in range(j):
@@ -117,63 +121,90 @@ def _solve_spd(a, b, n):
                 a[i, i] = math.sqrt(s)
             else:
                 a[i, j] = s / a[j, j]
-    for i in range(n):
+    return True
+
+
+@kernel
+def _solve(a, b):
+    """b becomes the solution of (a a^T) x = b for a lower factor a."""
+    for i in range(6):
         for k in range(i):
             b[i] -= a[i, k] * b[k]
         b[i] /= a[i, i]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
+    for i in range(5, -1, -1):
+        for k in range(i + 1, 6):
             b[i] -= a[k, i] * b[k]
         b[i] /= a[i, i]
-    return True
 
 
 @kernel
-def _edge_fit(ranges, row, col, plane_u, plane_v, pitch_mm, sigma, a, b, phi, out):
-    """Quadratic over the neighbours that belong to the cell's own surface, its curvature held back by a ridge where they are few."""
+def _edge_fit(ranges, row, col, plane_u, plane_v, pitch_mm, sigma, widths, confidence, a, b, unit, out):
+    """Quadratics over the neighbours that belong to the cell's own surface, where some are missing: their curvature is held back by
+    a ridge, their width chosen as above. out: value above the cell's own range, slopes, noise gain."""
     height, width = ranges.shape
     centre = ranges[row, col]
-    reach, spread = 3, 1.5
-    a[:] = 0.0
-    b[:] = 0.0
-    unit = np.zeros(6)
-    count = 0
-    for dv in range(max(-reach, -row), min(reach, height - 1 - row) + 1):
-        for du in range(max(-reach, -col), min(reach, width - 1 - col) + 1):
-            z = ranges[row + dv, col + du] - centre
-            if not abs(z - plane_u * du - plane_v * dv) <= allowed_step(math.sqrt(du * du + dv * dv), pitch_mm, sigma):
-                continue
-            w = math.exp(-0.5 * (du * du + dv * dv) / spread**2)
-            phi[0], phi[1], phi[2], phi[3], phi[4], phi[5] = 1.0, du, dv, du * du, du * dv, dv * dv
-            for i in range(6):
-                b[i] += w * phi[i] * z
-                for j in range(i + 1):
-                    a[i, j] += w * phi[i] * phi[j]
-            count += 1
-    if count < 6:
-        return False
     # a curvature of BEND_TAN / 2 per pixel is one standard deviation of the prior
-    ridge = (sigma / (0.25 * BEND_TAN * pitch_mm + 1e-9)) ** 2 + 1e-3
-    for i in range(3, 6):
-        a[i, i] += ridge
-    keep = a.copy()
-    if not _solve_spd(a, b, 6):
-        return False
-    unit[0] = 1.0
-    if not _solve_spd(keep, unit, 6):
-        return False
-    out[0], out[1], out[2] = centre + b[0], b[1], b[2]
-    # without weights the variance of the value is unit[0] sigma^2; the window makes it at most that
-    out[3] = math.sqrt(max(unit[0], 0.0)) * 0.8
-    return True
+    ridge = RIDGE * (sigma / (pitch_mm + 1e-9)) ** 2 + 1e-3
+    low, high = -np.inf, np.inf
+    found = False
+    for scale in range(len(widths)):
+        reach = math.ceil(2.0 * widths[scale])
+        falloff = -0.5 / widths[scale] ** 2
+        a[:] = 0.0
+        b[:] = 0.0
+        count = 0
+        for dv in range(max(-reach, -row), min(reach, height - 1 - row) + 1):
+            for du in range(max(-reach, -col), min(reach, width - 1 - col) + 1):
+                z = ranges[row + dv, col + du] - centre - plane_u * du - plane_v * dv
+                if not abs(z) <= allowed_step(math.sqrt(du * du + dv * dv), pitch_mm, sigma):
+                    continue
+                w = math.exp(falloff * (du * du + dv * dv))
+                wu, wv = w * du, w * dv
+                wuu, wuv, wvv = wu * du, wu * dv, wv * dv
+                b[0], b[1], b[2] = b[0] + w * z, b[1] + wu * z, b[2] + wv * z
+                b[3], b[4], b[5] = b[3] + wuu * z, b[4] + wuv * z, b[5] + wvv * z
+                a[0, 0], a[1, 0], a[2, 0] = a[0, 0] + w, a[1, 0] + wu, a[2, 0] + wv
+                a[3, 0], a[4, 0], a[5, 0] = a[3, 0] + wuu, a[4, 0] + wuv, a[5, 0] + wvv
+                a[3, 1], a[4, 1], a[5, 1] = a[3, 1] + wuu * du, a[4, 1] + wuu * dv, a[5, 1] + wuv * dv
+                a[5, 2] += wvv * dv
+                a[3, 3], a[4, 3], a[5, 3] = a[3, 3] + wuu * du * du, a[4, 3] + wuu * du * dv, a[5, 3] + wuu * dv * dv
+                a[5, 4], a[5, 5] = a[5, 4] + wuv * dv * dv, a[5, 5] + wvv * dv * dv
+                count += 1
+        if count < 6:
+            continue
+        a[1, 1], a[2, 1], a[2, 2] = a[3, 0], a[4, 0], a[5, 0]
+        a[3, 2], a[4, 2], a[4, 4] = a[4, 1], a[5, 1], a[5, 3]
+        for i in range(3, 6):
+            a[i, i] += ridge
+        unit[:] = 0.0
+        unit[0] = 1.0
+        if not _cholesky(a):
+            continue
+        _solve(a, b)
+        _solve(a, unit)
+        variance = 0.0
+        for dv in range(max(-reach, -row), min(reach, height - 1 - row) + 1):
+            for du in range(max(-reach, -col), min(reach, width - 1 - col) + 1):
+                z = ranges[row + dv, col + du] - centre - plane_u * du - plane_v * dv
+                if not abs(z) <= allowed_step(math.sqrt(du * du + dv * dv), pitch_mm, sigma):
+                    continue
+                part = unit[0] + unit[1] * du + unit[2] * dv + unit[3] * du * du + unit[4] * du * dv + unit[5] * dv * dv
+                variance += (math.exp(falloff * (du * du + dv * dv)) * part) ** 2
+        gain = math.sqrt(variance)
+        low, high = max(low, b[0] - confidence * gain * sigma), min(high, b[0] + confidence * gain * sigma)
+        if found and low > high:
+            break
+        found = True
+        out[0], out[1], out[2], out[3] = b[0], plane_u + b[1], plane_v + b[2], gain
+    return found
 
 
 @kernel
-def _fits(ranges, sigma_cell, pitch, plane_u, plane_v, windows, reaches, gains, confidence, first, last, out):
+def _fits(ranges, sigma_cell, pitch, plane_u, plane_v, windows, reaches, gains, edge_widths, confidence, first, last, out):
     """out (h, w, 4): range, slopes, standard error in mm of each cell; NaN where a cell has too few neighbours of its own surface."""
     height, width = ranges.shape
     scales = len(reaches)
-    a, b, phi, edge = np.zeros((6, 6)), np.zeros(6), np.zeros(6), np.zeros(4)
+    a, b, unit, edge = np.zeros((6, 6)), np.zeros(6), np.zeros(6), np.zeros(4)
     for row in range(first, last):
         for col in range(width):
             out[row, col, :] = np.nan
@@ -212,13 +243,9 @@ def _fits(ranges, sigma_cell, pitch, plane_u, plane_v, windows, reaches, gains, 
                 out[row, col, 1] = pu + slope_u
                 out[row, col, 2] = pv + slope_v
                 out[row, col, 3] = gains[scale] * sigma
-            if not found and _edge_fit(ranges, row, col, pu, pv, pitch_mm, sigma, a, b, phi, edge):
-                out[row, col, 0], out[row, col, 1], out[row, col, 2], out[row, col, 3] = (
-                    edge[0],
-                    edge[1],
-                    edge[2],
-                    edge[3] * sigma,
-                )
+            if not found and _edge_fit(ranges, row, col, pu, pv, pitch_mm, sigma, edge_widths, confidence, a, b, unit, edge):
+                out[row, col, 0], out[row, col, 1], out[row, col, 2] = centre + edge[0], edge[1], edge[2]
+                out[row, col, 3] = edge[3] * sigma
 
 
 def noise_by_obliquity(roughness: FloatArray, cosine: FloatArray, stated_mm: float | None) -> FloatArray:
@@ -274,6 +301,10 @@ def quiet_ranges(
     out = np.empty((height, width, 4), np.float32)
     windows, reaches, gains = quadratic_windows()
     in_chunks(
-        lambda i, j: _fits(ranges, sigma, pitch, slope_u, slope_v, windows, reaches, gains, confidence, i, j, out), height, ROWS
+        lambda i, j: _fits(
+            ranges, sigma, pitch, slope_u, slope_v, windows, reaches, gains, EDGE_WIDTHS_PX, confidence, i, j, out
+        ),
+        height,
+        ROWS,
     )
     return out, sigma

@@ -10,11 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from rangecheck import rigid
-from rangecheck.arrays import FloatArray, IntArray
+from rangecheck.arrays import BoolArray, FloatArray, IntArray
 from rangecheck.errors import ScanError
 from rangecheck.kernels import in_chunks, kernel
 from rangecheck.optics import Camera
@@ -22,10 +24,14 @@ from rangecheck.scan import RangeScan
 from rangecheck.surface.meshing.local_fit import BEND_TAN, quiet_ranges
 from rangecheck.surface.meshing.projection import project, projection_of
 
-#: numbers per cell: range, half u slope, half v slope, weight, normal x y z, |ray . normal|
-RANGE, HALF_U, HALF_V, WEIGHT, NORMAL, COSINE, FIELDS = 0, 1, 2, 3, 4, 7, 8
+#: numbers per cell: range, half u slope, half v slope, weight, normal x y z, |ray . normal|, variance along the normal
+RANGE, HALF_U, HALF_V, WEIGHT, NORMAL, COSINE, VARIANCE, FIELDS = 0, 1, 2, 3, 4, 7, 8, 9
 #: cells over which the weight rises from the edge of what a scan saw
-FEATHER_CELLS = 4.0
+FEATHER_CELLS = 2.5
+#: half width of the gaps between samples of other scans, projected into a scan, that count as covered
+GAP_CELLS = 2
+#: standard error, in cells, of where a ray points
+ASIDE_CELLS = 0.05
 #: cells seen at a flatter angle than this carry no weight
 FLATTEST_COSINE = 0.1
 
@@ -35,7 +41,7 @@ class Views:
     """All scans, concatenated.
 
     kind (s,) int64; numbers (s, 37) pose and camera; size (s, 2) int64 height, width; start (s,) int64 first cell of each scan;
-    cells (n, 8) float32 records: range is NaN where nothing is known and +inf where the ray met nothing;
+    cells (n, 9) float32 records: range is NaN where nothing is known and +inf where the ray met nothing;
     noise_mm (n,) float32 standard deviation of one range; samples_mm (k, 3) valid samples, shifted world frame;
     spacing_mm median distance between neighbouring samples along the surface; shift_mm (3,)."""
 
@@ -49,6 +55,12 @@ class Views:
     spacing_mm: float
     shift_mm: FloatArray
 
+    @cached_property
+    def typical_weight(self) -> float:
+        """Median weight of the cells that have one."""
+        weight = self.cells[:, WEIGHT]
+        return float(np.median(weight[weight > 0]))
+
     @property
     def arrays(self) -> tuple[IntArray, FloatArray, IntArray, IntArray, FloatArray]:
         """What the kernels take first: kind, numbers, size, start, cells."""
@@ -56,7 +68,7 @@ class Views:
 
 
 @kernel
-def _records(fit, origins, directions, rotation, edge, first, last, cells):
+def _records(fit, origins, directions, rotation, edge, pitch, first, last, cells):
     """Fill the records of rows first..last from the local fits."""
     height, width = fit.shape[0], fit.shape[1]
     for row in range(first, last):
@@ -88,16 +100,17 @@ def _records(fit, origins, directions, rotation, edge, first, last, cells):
             flip = -1.0 if along > 0.0 else 1.0
             nx, ny, nz = flip * nx / length, flip * ny / length, flip * nz / length
             cosine = abs(along)
+            aside = ASIDE_CELLS * (pitch[0] * r + pitch[1])
             if cosine < FLATTEST_COSINE:
                 continue
-            error = float(fit[row, col, 3]) * cosine
+            error = math.hypot(float(fit[row, col, 3]) * cosine, aside * math.sqrt(max(1.0 - cosine * cosine, 0.0)))
             feather = min(1.0, edge[row, col] / FEATHER_CELLS)
             cells[i, 0], cells[i, 1], cells[i, 2] = r, 0.5 * su, 0.5 * sv
-            cells[i, 3] = feather * feather * cosine / (error * error)
+            cells[i, 3] = feather * cosine / (error * error)
             cells[i, 4] = rotation[0, 0] * nx + rotation[0, 1] * ny + rotation[0, 2] * nz
             cells[i, 5] = rotation[1, 0] * nx + rotation[1, 1] * ny + rotation[1, 2] * nz
             cells[i, 6] = rotation[2, 0] * nx + rotation[2, 1] * ny + rotation[2, 2] * nz
-            cells[i, 7] = cosine
+            cells[i, 7], cells[i, 8] = cosine, error * error
 
 
 @kernel
@@ -138,19 +151,26 @@ def _cells_from_edge(fit, pitch, distance):
 
 @kernel
 def _mark_hit(kind, numbers, height, width, samples, step, hit):
-    """hit (h, w): cells on which a sample of any scan projects, and their neighbours within two cells."""
+    """hit (h, w): cells on which a sample of any scan projects."""
     for i in range(0, len(samples), step):
         u, v, r = project(kind, numbers, samples[i, 0], samples[i, 1], samples[i, 2])
-        if r <= 0.0 or not (-2.0 < u < width + 1.0 and -2.0 < v < height + 1.0):
-            continue
-        col, row = math.floor(u + 0.5), math.floor(v + 0.5)
-        for rr in range(max(row - 2, 0), min(row + 2, height - 1) + 1):
-            for cc in range(max(col - 2, 0), min(col + 2, width - 1) + 1):
-                hit[rr, cc] = True
+        if r > 0.0 and -0.5 < u < width - 0.5 and -0.5 < v < height - 0.5:
+            hit[math.floor(v + 0.5), math.floor(u + 0.5)] = True
+
+
+def _closed_up(mask: BoolArray) -> BoolArray:
+    """The mask with its gaps of up to 2 GAP_CELLS closed (dilated, then eroded), its outline unchanged."""
+    side = 2 * GAP_CELLS + 1
+    padded: BoolArray = np.pad(mask, 2 * GAP_CELLS)
+    for axis in (0, 1):
+        padded = np.asarray(sliding_window_view(padded, side, axis=axis).any(axis=-1))
+    for axis in (0, 1):
+        padded = np.asarray(sliding_window_view(padded, side, axis=axis).all(axis=-1))
+    return padded
 
 
 def _cells_of(scan: RangeScan, pose: FloatArray, known: dict[Camera, tuple[FloatArray, FloatArray]]):
-    """Kind, numbers (37,), records (h w, 8), noise (h w,) and lateral pitch at each record of one scan at `pose` (4, 4)."""
+    """Kind, numbers (37,), records (h w, 9), noise (h w,) and lateral pitch at each record of one scan at `pose` (4, 4)."""
     seen = projection_of(scan, known.get(scan.camera))
     known.clear()
     known[scan.camera] = seen.origins, seen.directions
@@ -161,7 +181,11 @@ def _cells_of(scan: RangeScan, pose: FloatArray, known: dict[Camera, tuple[Float
     _cells_from_edge(fit, seen.pitch, edge)
     cells = np.empty((height * width, FIELDS), np.float32)
     rotation = np.ascontiguousarray(pose[:3, :3])
-    in_chunks(lambda i, j: _records(fit, seen.origins, seen.directions, rotation, edge, i, j, cells), height, 32)
+    in_chunks(
+        lambda i, j: _records(fit, seen.origins, seen.directions, rotation, edge, seen.pitch, i, j, cells),
+        height,
+        32,
+    )
     numbers = np.concatenate([back[:3, :3].ravel(), back[:3, 3], seen.numbers])
     return seen.kind, numbers, cells, noise.ravel(), seen.pitch[0] * cells[:, RANGE] + seen.pitch[1]
 
@@ -182,10 +206,10 @@ def views_of(scans: Sequence[RangeScan]) -> Views:
     for scan, (kind, numbers, cells, _, lateral) in zip(scans, parts):
         good = cells[:, WEIGHT] > 0
         spacings.append(lateral[good] / np.sqrt(cells[good, COSINE]))
-        hit = np.zeros(scan.range_mm.shape, bool)
+        hit = scan.valid.copy()
         _mark_hit(kind, numbers, *hit.shape, points, 2, hit)
         # a ray that returned nothing, and on which no other scan saw anything, ran through empty space
-        cells[~scan.valid.ravel() & ~hit.ravel(), RANGE] = np.inf
+        cells[~_closed_up(hit).ravel(), RANGE] = np.inf
     spacing = np.concatenate(spacings)
     if len(spacing) == 0:
         raise ScanError("the scans' samples lie too far apart to span a surface; check the unit, or use poisson or pivot")
