@@ -124,6 +124,8 @@ def test_two_cameras_find_the_sphere_and_the_wall(both, truth):
     # cells are 3 pixels wide here: a tenth of a pixel is a thirtieth of a cell
     assert np.median(found) < TENTH_PX_MM and np.percentile(found, 90) < 4 * TENTH_PX_MM
     assert np.nanmedian(decoded.both_px) < 0.1 and (decoded.both_px <= decoded.residual_px + 1e-6)[decoded.scan.valid].all()
+    told, true = decoded.scan.noise_mm, np.median(found) / 0.6745
+    assert 0.4 * true < told < 2.5 * true, "stated noise is that of the ranges, not that of their smooth neighbours"
     assert decoded.measured + decoded.counts()["interpolated"] == decoded.scan.valid.sum()
     assert 0.2 * decoded.measured > decoded.cells > 0.02 * decoded.measured
     assert 0.5 < np.median(decoded.scan.brightness[decoded.scan.valid]) < 1

@@ -5,7 +5,9 @@ With two calibrated cameras the projector needs no calibration: it only names th
 projector is the second eye, and its calibration is needed.
 
 A point lies on the ray of its pixel in the first camera, at the distance where it comes nearest, in the second picture, to the place
-that shows the same projector coordinates. What is left there is the epipolar residual, kept per pixel.
+that shows the same projector coordinates. What is left there is the epipolar residual, kept per pixel. Its scatter from pixel to
+pixel is also what the scan states as its noise: coordinates are smoothed over windows of two cells, so neighbouring ranges alone
+(`scan.noise`) would say too little.
 """
 
 from __future__ import annotations
@@ -27,6 +29,8 @@ from rangecheck.scan.range_scan import RangeScan
 MIN_CONTRAST = 0.03
 MAX_RESIDUAL_PX = 3.0
 _STEPS = 4
+#: pixels over which the residual of a wrong calibration stays the same
+_CALIBRATION_PX = 12.0
 
 
 class Reason(IntEnum):
@@ -135,7 +139,8 @@ def decode_gray_code(
             f"{name}: {int(known.sum())} pixels were decoded and none could be placed; check the calibration and which eye is which"
         )
     bright = np.clip(left.white / left.full_scale, 0, 1).astype(np.float32)
-    scan = RangeScan(maps[0], left_view.camera, left_view.world_from_camera, bright, name)
+    noise = _noise_mm(ask, np.where(good, found.across_px, np.nan), found.mm_per_px[good]) if seen.row is not None else None
+    scan = RangeScan(maps[0], left_view.camera, left_view.world_from_camera, bright, name, noise_mm=noise)
     cell = np.floor(first.value[scan.valid]).astype(np.int64)
     cells = len(np.unique(cell[:, 0] * 65536 + cell[:, 1]))
     return DecodedScan(scan, reason, scan.valid & ~first.own, maps[1], maps[2], tuple(lost), cells)
@@ -159,6 +164,8 @@ class _Found(NamedTuple):
     range_mm: FloatArray
     residual_px: FloatArray
     both_px: FloatArray
+    across_px: FloatArray  # the residual with its sign, across the epipolar line
+    mm_per_px: FloatArray  # how far the range moves with the place along the line
 
 
 def _triangulated(first: View, second: View, uv: FloatArray, place: FloatArray, two_axes: bool) -> _Found:
@@ -166,7 +173,7 @@ def _triangulated(first: View, second: View, uv: FloatArray, place: FloatArray, 
     across = rigid.inverse(second.world_from_camera) @ first.world_from_camera
     weight = np.array([1.0, 1.0 if two_axes else 0.0])
 
-    def solve(uv: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def solve(uv: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         origin, direction = first.camera.rays(uv[:, 0], uv[:, 1])
         origin, direction = rigid.move_points(across, origin), rigid.move_directions(across, direction)
         other_origin, other = second.camera.rays(place[:, 0], place[:, 1])
@@ -186,9 +193,9 @@ def _triangulated(first: View, second: View, uv: FloatArray, place: FloatArray, 
                 here = error(away)
                 change = (error(away + step) - here) / step[:, None]
                 away = away - (change * here).sum(axis=1) / (change * change).sum(axis=1)
-        return away, error(away)
+        return away, error(away), change
 
-    away, left_over = solve(uv)
+    away, left_over, change = solve(uv)
     residual = np.hypot(left_over[:, 0], left_over[:, 1])
     # how far the signed residual moves per pixel of the first picture, from some hundreds of points: it hardly varies
     some = np.flatnonzero(np.isfinite(residual) & (residual > 0.05))
@@ -201,7 +208,28 @@ def _triangulated(first: View, second: View, uv: FloatArray, place: FloatArray, 
         place = kept
         per_pixel = float(np.nanmedian(np.hypot(*shifts)))
         both = residual / np.sqrt(2 * (1 + per_pixel**2))
-    return _Found(np.where(np.isfinite(away), away, np.nan), np.where(np.isfinite(residual), residual, np.inf), both)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        px_per_mm = np.hypot(change[:, 0], change[:, 1])
+        across_px = (left_over[:, 1] * change[:, 0] - left_over[:, 0] * change[:, 1]) / px_per_mm
+        mm_per_px = 1 / px_per_mm
+    away = np.where(np.isfinite(away), away, np.nan)
+    return _Found(away, np.where(np.isfinite(residual), residual, np.inf), both, across_px, mm_per_px)
+
+
+def _noise_mm(ask: BoolArray, across_px: FloatArray, mm_per_px: FloatArray) -> float | None:
+    """Standard deviation of range: what the residual across the epipolar line, less its mean over some cells around (which is the
+    calibration's), scatters by; places scatter along the line as much, and that is range. None with too few pixels to tell."""
+    from scipy.ndimage import gaussian_filter
+
+    known = np.zeros(ask.shape, np.float32)
+    signed = np.zeros(ask.shape, np.float32)
+    known[ask], signed[ask] = np.isfinite(across_px), np.nan_to_num(across_px)
+    weight = gaussian_filter(known, _CALIBRATION_PX)
+    fluctuation = signed - gaussian_filter(signed, _CALIBRATION_PX) / np.maximum(weight, 1e-6)
+    inside = (known > 0) & (weight > 0.5)
+    if inside.sum() < 1000:
+        return None
+    return float(np.median(np.abs(fluctuation[inside])) / 0.6745 * np.median(mm_per_px))
 
 
 def _in_plane(camera: Camera, place: FloatArray, origin: FloatArray, direction: FloatArray) -> FloatArray:
