@@ -171,7 +171,7 @@ def test_far_from_the_origin_costs_nothing(views):
 @pytest.mark.real_data
 def test_the_bunny_returns_after_five_millimetres_and_five_degrees(real_data):
     truth = read_scans(real_data / "stanford_bunny" / "bun.conf", unit="m")
-    result = register(shaken(truth, 5.0, 5.0, seed=1), enough_points=15_000)
+    result = register(shaken(truth, 5.0, 5.0, seed=1), enough_points=9_000)
     assert result.verdict == "aligned"
     assert np.median(strays_mm(result.scans, truth)) < 0.3
 

@@ -199,6 +199,9 @@ class RayGrid(Camera):
         require("origins_mm", self.origins_mm, shape)
         require("directions", self.directions, shape)
 
+    def pixel_rays(self) -> tuple[FloatArray, FloatArray]:
+        return self.origins_mm, unit_vectors(self.directions)
+
     def rays(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
         column, row = np.clip(np.asarray(u), 0, self.width - 1), np.clip(np.asarray(v), 0, self.height - 1)
         c0, r0 = np.minimum(column.astype(int), max(self.width - 2, 0)), np.minimum(row.astype(int), max(self.height - 2, 0))

@@ -30,8 +30,8 @@ from rangecheck.scan.registration.turntable import Turntable, departure_mm, find
 
 #: pull of a turntable on its scans, as a share of their weight: below what a well-shaped overlap says, above what noise says
 _HOLD = 2e-3
-#: overlap and excess over noise of a pair found without a guess, which was picked from many
-_OVERLAP_WITHOUT_GUESS, _EXCESS_WITHOUT_GUESS = 0.2, 5.0
+#: what a pair found without a guess must show, having been picked from many: overlap, consistency, excess over noise
+_OVERLAP_WITHOUT_GUESS, _CONSISTENCY_WITHOUT_GUESS, _EXCESS_WITHOUT_GUESS = 0.2, 0.85, 5.0
 
 
 def register(
@@ -62,7 +62,7 @@ def register(
     rescue      look for scans whose guess was wrong as if there were none
     angles_deg  turntable: angle of each scan (n,), without it equal steps of a full turn; their sense is found
     axis_direction, axis_point_mm  turntable: in the world, without them the picture's upward direction, and searched for
-    least_overlap, least_consistency, most_intruding, agree_mm, most_excess  see `Rules`; without a guess overlap must be at least 0.2 and excess at most 5
+    least_overlap, least_consistency, most_intruding, agree_mm, most_excess  see `Rules`; without a guess overlap must be at least 0.2, consistency 0.85, and excess at most 5
     enough_points  points per scan beyond which its grid is thinned
     features, trials  of the search without a guess: points described per scan, motions tried per pair
 
@@ -114,13 +114,15 @@ def register(
         strict = replace(
             rules,
             least_overlap=max(rules.least_overlap, _OVERLAP_WITHOUT_GUESS),
+            least_consistency=max(rules.least_consistency, _CONSISTENCY_WITHOUT_GUESS),
             most_excess=min(rules.most_excess, _EXCESS_WITHOUT_GUESS),
         )
         groups, ties, more_objections = join_without_guess(samples, groups, strict, seed=seed, trials=trials, features=features)
         tried += [tie.pair for tie in ties]
         objections += more_objections
     # a turntable's poses that held to the last scan need no other support; those found without it do
-    main, poses, decided, more = _settle(samples, groups, rules, hold if len(held) == n else 0.0)
+    settled = decision if guess != "none" and len(held) == n else None
+    main, poses, decided, more = _settle(samples, groups, rules, hold if len(held) == n else 0.0, settled)
     iterations += more
     anchor = anchor if anchor in main else main[0]
     back = given[anchor] @ rigid.inverse(poses[anchor])
@@ -155,12 +157,16 @@ def register(
 
 
 def _settle(
-    samples: Sequence[Samples], groups: Groups, rules: Rules, hold: float
+    samples: Sequence[Samples], groups: Groups, rules: Rules, hold: float, settled: Decision | None
 ) -> tuple[list[int], dict[int, FloatArray], Decision | None, int]:
     """The largest group aligned once more without the others, which may have pulled at it, and judged again, until it stays whole.
 
+    settled  the decision on all scans, if they hang together already and nothing pulled at them
+
     Members, their poses, the decision on them (None when no two scans hang together), iterations."""
     main, poses = groups.largest(), dict(enumerate(groups.pose))
+    if settled is not None:
+        return main, poses, settled, 0
     total = 0
     while len(main) > 1:
         local = [samples[k] for k in main]
