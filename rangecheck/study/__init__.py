@@ -1,1 +1,22 @@
-"""Speed against accuracy, and stability; takes callables, imports no stage."""
+"""Speed against accuracy, and stability: takes callables, knows no stage. Definitions of studies live in `rangecheck.studies`."""
+
+from rangecheck.study.machine import describe_machine
+from rangecheck.study.result import EdgeChart, Line, LineChart, SpeedChart, Study, write_study
+from rangecheck.study.speed import Candidate, Measurement, measure, pareto_front
+from rangecheck.study.stability import Edge, find_edge
+
+__all__ = [
+    "Candidate",
+    "Edge",
+    "EdgeChart",
+    "Line",
+    "LineChart",
+    "Measurement",
+    "SpeedChart",
+    "Study",
+    "describe_machine",
+    "find_edge",
+    "measure",
+    "pareto_front",
+    "write_study",
+]

@@ -1,0 +1,183 @@
+"""The engine of studies: methods timed in turns, fronts, edges cornered by bisection, charts and documents that say what they ran on."""
+
+import json
+import math
+
+import pytest
+
+from rangecheck.errors import OutputError, SceneError, SettingError
+from rangecheck.study import (
+    Candidate,
+    EdgeChart,
+    Line,
+    LineChart,
+    Measurement,
+    SpeedChart,
+    Study,
+    describe_machine,
+    find_edge,
+    measure,
+    pareto_front,
+    write_study,
+)
+from rangecheck.study.charts import draw
+
+
+class Clock:
+    """A clock that only the candidates move."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def __call__(self):
+        return self.now
+
+
+def candidate(clock, log, method, seconds, result):
+    def run():
+        log.append(method)
+        clock.now += seconds
+        return result
+
+    return Candidate(method, "", run)
+
+
+def test_methods_are_timed_in_turns_forwards_and_backwards_after_a_warm_up():
+    clock, log = Clock(), []
+    candidates = [candidate(clock, log, "a", 2.0, 0.1), candidate(clock, log, "b", 3.0, -0.2)]
+    measured = measure(candidates, abs, rounds=4, warmups=2, clock=clock)
+    assert log == ["a", "a", "b", "b"] + ["a", "b", "b", "a"] * 2
+    assert [(m.method, m.seconds, m.error, m.rounds) for m in measured] == [("a", 2.0, 0.1, 4), ("b", 3.0, 0.2, 4)]
+    assert measured[0].quartiles == (2.0, 2.0)
+
+
+def test_the_time_is_the_median_and_the_spread_its_quartiles():
+    clock, times = Clock(), iter([9.0, 1.0, 2.0, 3.0, 4.0, 100.0])
+
+    def run():
+        clock.now += next(times)
+
+    (only,) = measure([Candidate("a", "", run)], lambda _: 0.0, rounds=5, clock=clock)
+    assert only.seconds == 3.0 and only.quartiles == (2.0, 4.0)
+
+
+def test_what_cannot_be_measured_is_refused():
+    same = [Candidate("a", "1", int), Candidate("a", "1", int)]
+    with pytest.raises(SettingError, match=r"two candidates are called \('a', '1'\)"):
+        measure(same, float)
+    with pytest.raises(SettingError, match="0 candidates"):
+        measure([], float)
+    with pytest.raises(SettingError, match="0 rounds"):
+        measure(same[:1], float, rounds=0)
+
+
+def timed(method, seconds, error):
+    return Measurement(method, "", error, seconds, (seconds, seconds), 1)
+
+
+def test_the_front_holds_what_nothing_beats_in_both():
+    all_of = [
+        timed("slow best", 9, 0.01),
+        timed("fast", 1, 0.5),
+        timed("beaten", 5, 0.5),
+        timed("middle", 3, 0.1),
+        timed("mute", 0.1, math.nan),
+    ]
+    assert [m.method for m in pareto_front(all_of)] == ["fast", "middle", "slow best"]
+    assert pareto_front([]) == []
+
+
+@pytest.mark.parametrize("edge", [0.0123, 7.5, 950.0])
+def test_an_edge_is_cornered_to_its_tolerance_from_either_side(edge):
+    up = find_edge("square", lambda k: (k / edge) ** 2, 1e-3, 1e3, 1.0, logarithmic=True, tolerance=1e-6)
+    assert up.holds_at <= edge <= up.breaks_at <= up.holds_at * (1 + 2e-6)
+    down = find_edge("inverse", lambda k: edge / k, 1e3, 1e-3, 1.0, logarithmic=True, tolerance=1e-6)
+    assert down.breaks_at <= edge <= down.holds_at <= down.breaks_at * (1 + 2e-6)
+    even = find_edge("line", lambda k: k / edge, 0.0, 1e3, 1.0, tolerance=1e-7)
+    assert even.holds_at <= edge <= even.breaks_at <= even.holds_at + 1e-4
+
+
+def test_the_first_of_several_edges_is_the_one_that_is_found():
+    edge = find_edge("waves", lambda k: math.sin(k), 0.0, 20.0, 0.5, samples=201, tolerance=1e-9)
+    assert edge.breaks_at == pytest.approx(math.pi / 6, abs=1e-6)
+    assert edge.in_words == "waves: holds 0.5 up to 0.523599, breaks it at 0.523599"
+
+
+def test_nothing_to_find_and_nothing_that_holds_are_both_said():
+    whole = find_edge("calm", lambda k: 0.0, 0.0, 1.0, 0.5)
+    assert whole.breaks_at is None and whole.holds_at == 1.0 and "holds 0.5 from 0 to 1" in whole.in_words
+    never = find_edge("wild", lambda k: 1.0, 0.0, 1.0, 0.5)
+    assert never.holds_at is None and never.breaks_at == 0.0 and "from the start" in never.in_words
+
+
+def test_no_number_and_an_error_raised_on_purpose_count_as_broken():
+    def fails(k):
+        if k > 2.0:
+            raise SceneError("no")
+        return math.nan if k > 1.0 else 0.0
+
+    assert find_edge("fails", fails, 0.0, 4.0, 0.5, tolerance=1e-9).breaks_at == pytest.approx(1.0, abs=1e-6)
+    with pytest.raises(ZeroDivisionError):
+        find_edge("bug", lambda k: 1 / 0, 0.0, 1.0, 0.5)
+
+
+@pytest.mark.parametrize(("start", "stop", "logarithmic"), [(0.0, 1.0, True), (1.0, 1.0, False), (0.0, math.inf, False)])
+def test_an_empty_sweep_is_refused(start, stop, logarithmic):
+    with pytest.raises(SettingError, match="needs two different ends"):
+        find_edge("none", float, start, stop, 1.0, logarithmic=logarithmic)
+
+
+def a_study():
+    speed = SpeedChart(
+        "speed",
+        "Speed",
+        "error",
+        "ns each",
+        [timed("a", 1e-3, 0.1), timed("b", 5e-3, 0.0), timed("c", 9e-3, math.nan)],
+        1000,
+        1e9,
+    )
+    edges = EdgeChart("edge", "Edge", "knob", "error", [find_edge("a", lambda k: k, 1e-3, 10, 1.0, logarithmic=True)])
+    lines = LineChart("lines", "Lines", "x", "y", [Line("one", [1, 2], [1.0, math.nan], True)], level=1.0)
+    return Study(
+        "trial",
+        "A trial",
+        [speed, edges, lines],
+        ["found"],
+        {"rows": [{"x": math.inf}]},
+        {**describe_machine(), "load_average_1min": 0.0},
+    )
+
+
+def test_a_study_is_written_as_pictures_and_one_document_that_json_allows(tmp_path):
+    written = write_study(a_study(), tmp_path / "out")
+    assert [p.name for p in written] == ["trial.json"] + [
+        f"trial-{s}.{k}" for s in ("speed", "edge", "lines") for k in ("svg", "png")
+    ]
+    document = json.loads(written[0].read_text(), parse_constant=pytest.fail)
+    assert document["schema"] == "rangecheck/study/1" and document["machine"]["cores"] >= 1
+    speed, edge, lines = document["charts"]
+    assert [(m["method"], m["time"], m["on_front"]) for m in speed["measurements"]] == [
+        ("a", 1000.0, True),
+        ("b", 5000.0, True),
+        ("c", 9000.0, False),
+    ]
+    assert speed["measurements"][2]["error"] is None and document["tables"]["rows"] == [{"x": None}]
+    assert edge["edges"][0]["breaks_at"] == pytest.approx(1.0, rel=2e-3) and "breaks it at" in edge["edges"][0]["in_words"]
+    assert (
+        lines["kind"] == "line"
+        and written[1].read_bytes().startswith(b"<?xml")
+        and written[2].read_bytes().startswith(b"\x89PNG")
+    )
+    with pytest.raises(OutputError, match="exists already"):
+        write_study(a_study(), tmp_path / "out", force=False)
+
+
+def test_the_same_numbers_give_the_same_bytes():
+    study = a_study()
+    assert draw(study.charts[0], study.machine) == draw(study.charts[0], study.machine)
+
+
+def test_the_machine_says_processor_and_versions():
+    machine = describe_machine()
+    assert machine["processor"] and machine["packages"]["numpy"] and machine["python"]
