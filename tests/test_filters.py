@@ -1,5 +1,8 @@
 """Filters and noise on a ball before a slanted wall, whose every distance and slant is known."""
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -176,6 +179,42 @@ def test_threads_do_not_change_a_bit():
         alone = smooth_ranges(scan, sigma_mm=sigma)[0].range_mm.tobytes()
     with threads(3):
         assert smooth_ranges(scan, sigma_mm=sigma)[0].range_mm.tobytes() == alone
+
+
+UNCOMPILED = """
+import sys, numpy as np
+from rangecheck.optics import PinholeCamera
+from rangecheck.scan import RangeScan
+from rangecheck.scan.decode.code import coordinates
+from rangecheck.scan.decode.match import partners, smoothed
+from rangecheck.scan.filters import remove_flying_pixels, remove_isolated, remove_oblique, smooth_ranges
+from rangecheck.scan.noise import estimate_noise
+
+ranges = np.random.default_rng(0).normal(500, 0.2, (24, 30))
+ranges[5:8, 5:9] = np.nan
+ranges[16:, 20:] += 100
+scan = RangeScan(ranges, PinholeCamera(30, 24, 50.0, 50.0, 14.5, 11.5))
+noise = estimate_noise(scan)
+results = [np.array([noise.normal_mm, noise.slant_power])]
+results += [f(scan, sigma_mm=0.2)[0].range_mm for f in (remove_flying_pixels, remove_isolated, remove_oblique, smooth_ranges)]
+cell = np.linspace(1, 15, 60).astype(int)
+bits = [np.where(((cell ^ cell >> 1) >> k) & 1, 1.0, -1.0) for k in (3, 2, 1, 0)]
+column, _ = coordinates(np.repeat(np.array(bits, np.float32)[:, None], 10, 1), np.ones((10, 60), bool), 0)
+seen = smoothed(column, np.repeat(np.linspace(1, 3, 10, dtype=np.float32)[:, None], 60, 1))
+np.savez(sys.argv[1], *results, column, seen.value, partners(seen, seen)[0])
+"""
+
+
+def test_kernels_mean_the_same_without_the_compiler(tmp_path):
+    for name, off in (("compiled", "0"), ("plain", "1")):
+        environment = {**os.environ, "NUMBA_DISABLE_JIT": off}
+        subprocess.run(
+            [sys.executable, "-W", "error", "-c", UNCOMPILED, str(tmp_path / f"{name}.npz")], env=environment, check=True
+        )
+    compiled, plain = np.load(tmp_path / "compiled.npz"), np.load(tmp_path / "plain.npz")
+    for key in compiled.files:
+        # sums in another order differ in the last digits of float32
+        assert np.allclose(compiled[key], plain[key], rtol=1e-5, atol=1e-5, equal_nan=True), key
 
 
 @pytest.mark.real_data

@@ -185,7 +185,7 @@ class RayGrid(Camera):
     """Any other grid of rays, as measured: unit `directions` and `origins_mm`, both (height, width, 3), camera frame.
 
     Cells whose ray is not known hold NaN. Between cells rays are interpolated, and `project` inverts exactly that interpolation
-    (to 1e-4 cells; NaN where neighbouring rays cross); in cells without a ray it follows the law of the others. It needs rays that
+    (to 1e-3 cells; NaN where neighbouring rays cross); in cells without a ray it follows the law of the others. It needs rays that
     all run forward along z, as of light-stripe scanners and cameras, or that start in one point, as of scanners that turn.
     Other scanners' views can be read, but points cannot be projected into them."""
 

@@ -88,7 +88,8 @@ def corpus(folder: Path) -> dict[str, bytes]:
 
 
 def _e57_and_range_map(scan: RangeScan) -> dict[str, bytes]:
-    from test_readers_formats import grid_e57, range_map
+    from test_readers_e57 import grid_e57
+    from test_readers_maps import range_map
 
     return {"a.e57": grid_e57(), "map.ply": range_map(scan)}
 

@@ -26,7 +26,7 @@ LONGEST_S, MOST_BYTES = 5.0, 1 << 30
 
 def good_pages(content: bytes) -> bytes:
     """E57 content with checksums that fit again, so that what lies behind them is reached."""
-    from test_readers_formats import crc_pages
+    from test_readers_e57 import crc_pages
 
     logical = b"".join(content[k : k + 1020] for k in range(0, len(content), 1024))
     paged = crc_pages(logical)

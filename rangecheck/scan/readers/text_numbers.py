@@ -42,7 +42,7 @@ def _scan(text, position, decimal, separator, columns, powers, out, hard):
     size = text.size
     while count < out.size and n_hard < len(hard):
         while position < size:
-            c = text[position]
+            c = int(text[position])
             if c == 10:
                 if columns > 0 and in_line > 0 and in_line != columns:
                     return count, n_hard, position, line_start
@@ -60,7 +60,7 @@ def _scan(text, position, decimal, separator, columns, powers, out, hard):
         mantissa, digits, exponent, plain = np.uint64(0), 0, 0, True
         seen, after_point = False, False
         while position < size:
-            c = text[position]
+            c = int(text[position])
             if 48 <= c <= 57:
                 seen = True
                 if digits < 19:
@@ -85,7 +85,7 @@ def _scan(text, position, decimal, separator, columns, powers, out, hard):
             while position < size and 48 <= text[position] <= 57:
                 any_digit = True
                 if power < 10000:
-                    power = power * 10 + (text[position] - 48)
+                    power = power * 10 + (int(text[position]) - 48)
                 position += 1
             plain = plain and any_digit
             exponent += -power if down else power
