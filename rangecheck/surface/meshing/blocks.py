@@ -25,7 +25,7 @@ MOST_BLOCKS = 5e7
 @dataclass
 class Grid:
     """shape (3,) blocks in the box; index (bx, by, bz) int32 row of each block or MISSING; place (n, 3) int32 of each row;
-    near (n, 27) int32 rows of the blocks around, the 27 offsets x fastest; field, weight (n, 512) float32; state (n, 512) uint8."""
+    near (n, 27) int32 rows of the blocks around, the 27 offsets x fastest; field (n, 512) float32; state (n, 512) uint8."""
 
     origin_mm: FloatArray
     step_mm: float
@@ -33,7 +33,6 @@ class Grid:
     place: IntArray
     near: IntArray
     field: FloatArray
-    weight: FloatArray
     state: IntArray
 
     def corner_origins(self, rows: slice | IntArray = slice(None)) -> FloatArray:
@@ -79,7 +78,7 @@ def grid_near(
     index[also] = 0
     place = np.argwhere(index == 0).astype(np.int32)
     none = np.empty((0, CORNERS), np.float32)
-    grid = Grid(origin_mm, step_mm, index, place[:0], np.empty((0, 27), np.int32), none, none, np.empty((0, CORNERS), np.uint8))
+    grid = Grid(origin_mm, step_mm, index, place[:0], np.empty((0, 27), np.int32), none, np.empty((0, CORNERS), np.uint8))
     return add_blocks(grid, place)
 
 
@@ -89,7 +88,7 @@ def add_blocks(grid: Grid, place: IntArray) -> Grid:
     n = len(grid.place)
     grid.index[tuple(grid.place.T)] = np.arange(n, dtype=np.int32)
     more = np.empty((len(place), CORNERS), np.float32)
-    grid.field, grid.weight = np.concatenate([grid.field, more]), np.concatenate([grid.weight, more])
+    grid.field = np.concatenate([grid.field, more])
     grid.state = np.concatenate([grid.state, np.empty((len(place), CORNERS), np.uint8)])
     grid.near = np.empty((n, 27), np.int32)
     _neighbours(grid.index, grid.place, grid.near)

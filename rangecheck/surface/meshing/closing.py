@@ -8,41 +8,23 @@ bytes do not depend on the number of threads.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from rangecheck.arrays import FloatArray, IntArray
 from rangecheck.kernels import in_chunks, kernel
 from rangecheck.surface.meshing.blocks import COARSE, Grid, find, from_coarse
-from rangecheck.surface.meshing.distance import BLOCK, CORNERS, FREE, SEEN, fuse_point
+from rangecheck.surface.meshing.distance import BLOCK, CORNERS, FREE, SEEN, fill_blocks
+from rangecheck.surface.meshing.tiles import Tiles
 from rangecheck.surface.meshing.views import Views
 
 SWEEPS = 40
 RELAXATION = 1.8
 #: distance in coarse steps within which a view's distance is taken at a coarse node
 COARSE_REACH = 1.5
-
-
-@kernel
-def _nodes(kind, numbers, size, start, cells, free_weight, origin, step, reach, first, last, field, state):
-    ny, nz = field.shape[1], field.shape[2]
-    for i in range(first, last):
-        for j in range(ny):
-            for k in range(nz):
-                what, d, _ = fuse_point(
-                    kind,
-                    numbers,
-                    size,
-                    start,
-                    cells,
-                    free_weight,
-                    origin[0] + i * step,
-                    origin[1] + j * step,
-                    origin[2] + k * step,
-                    reach,
-                    reach,
-                )
-                state[i, j, k] = what
-                field[i, j, k] = d if what != 0 else -reach
+#: of the 27 blocks around and including one: itself and those that share a face with it
+FACES_AND_SELF = [4, 10, 12, 13, 14, 16, 22]
 
 
 @kernel
@@ -81,15 +63,24 @@ def _finer(field: FloatArray, shape: tuple[int, ...]) -> FloatArray:
     return np.ascontiguousarray(field)
 
 
-def coarse_field(views: Views, origin_mm: FloatArray, blocks: IntArray, step_mm: float) -> tuple[FloatArray, IntArray]:
+def _assembled(values: Any, count: tuple[int, ...], shape: tuple[int, ...]) -> Any:
+    """Blocks (n, 512), x fastest inside, last index fastest among them, as one array of `shape` along x, y, z."""
+    boxes = values.reshape(*count, BLOCK, BLOCK, BLOCK).transpose(0, 5, 1, 4, 2, 3)
+    whole = boxes.reshape([c * BLOCK for c in count])
+    return np.ascontiguousarray(whole[: shape[0], : shape[1], : shape[2]])
+
+
+def coarse_field(
+    views: Views, tiles: Tiles, origin_mm: FloatArray, blocks: IntArray, step_mm: float
+) -> tuple[FloatArray, IntArray]:
     """Field in mm and state at the coarse nodes of the box, (2 bx + 1, 2 by + 1, 2 bz + 1), closed everywhere."""
     shape = tuple(int(b) * BLOCK // COARSE + 1 for b in blocks)
     coarse_step = COARSE * step_mm
     reach = COARSE_REACH * coarse_step
-    field, state = np.empty(shape, np.float32), np.empty(shape, np.uint8)
-    in_chunks(
-        lambda i, j: _nodes(*views.arrays, views.typical_weight, origin_mm, coarse_step, reach, i, j, field, state), shape[0], 4
-    )
+    count = tuple(-(-length // BLOCK) for length in shape)
+    place = np.indices(count).reshape(3, -1).T
+    parts = fill_blocks(views, tiles, origin_mm + place * (BLOCK * coarse_step), coarse_step, reach, reach)
+    field, state = (_assembled(part, count, shape) for part in parts)
     for axis in range(3):
         for side in (0, -1):
             np.moveaxis(field, axis, 0)[side], np.moveaxis(state, axis, 0)[side] = reach, SEEN
@@ -158,7 +149,7 @@ def smooth_open(grid: Grid, sweeps: int) -> None:
     """Relax the field around the closed parts at full resolution, so that they meet the measured ones without a step."""
     chosen = np.zeros(len(grid.place), bool)
     in_chunks(lambda i, j: _open_blocks(grid.near, grid.field, grid.state, i, j, chosen), len(grid.place), 256)
-    around = np.unique(grid.near[chosen])
+    around = np.unique(grid.near[chosen][:, FACES_AND_SELF])
     rows = around[around >= 0].astype(np.int64)
     least = 0.02 * grid.step_mm
 

@@ -14,6 +14,7 @@ import numpy as np
 from rangecheck.arrays import FloatArray, IntArray
 from rangecheck.kernels import in_chunks, inline_kernel, kernel
 from rangecheck.surface.meshing.projection import project
+from rangecheck.surface.meshing.tiles import BEFORE, BEHIND, Tiles, side_of_block
 from rangecheck.surface.meshing.views import Views
 
 #: what is known at a point
@@ -79,68 +80,87 @@ def look(cells, start, height, width, u, v, r):
 
 
 @kernel
-def fuse_point(kind, numbers, size, start, cells, free_weight, x, y, z, before_mm, behind_mm):
-    """State, distance and weight. Behind the rim of what a view sees its tangent planes run on into empty space: what they call
-    inside is outside if the views that saw it empty outweigh them, each counting as a typical cell `before_mm` away."""
-    total = weighted = free = 0.0
-    soft = -np.inf
-    for s in range(len(kind)):
-        u, v, r = project(kind[s], numbers[s], x, y, z)
-        state, d, w, _, _, _, _ = look(cells, start[s], size[s, 0], size[s, 1], u, v, r)
-        if state < 0:
-            continue
-        if state == 0 or d > before_mm:
-            free += free_weight
-        elif d >= -behind_mm:
-            if w > 0.0:
-                # behind the surface the weight falls: what lies there may be another side of something thin
-                w *= 1.0 if d > -0.4 * behind_mm else (d + behind_mm) / (0.6 * behind_mm) + 1e-3
-                total += w
-                weighted += w * d
-        else:
-            soft = max(soft, d)
-    if total > 0.0 and (weighted >= 0.0 or weighted + free * before_mm <= 0.0):
-        return SEEN, weighted / total, total
-    if free > 0.0:
-        return FREE, before_mm, 0.0
-    return UNKNOWN, soft, 0.0
-
-
-@kernel
 def _fill_blocks(
-    kind, numbers, size, start, cells, free_weight, origins, step, before_mm, behind_mm, first, last, field, weight, state
-):
+    kind, numbers, size, start, cells, free_weight, tile_start, tile_low, tile_high, flattest,
+    origins, step, before_mm, behind_mm, first, last, field, state,
+):  # fmt: skip
+    total, weighted, free = np.empty(CORNERS), np.empty(CORNERS), np.empty(CORNERS)
     for b in range(first, last):
-        corner = 0
-        for k in range(BLOCK):
-            z = origins[b, 2] + k * step
-            for j in range(BLOCK):
-                y = origins[b, 1] + j * step
-                for i in range(BLOCK):
-                    x = origins[b, 0] + i * step
-                    what, d, w = fuse_point(kind, numbers, size, start, cells, free_weight, x, y, z, before_mm, behind_mm)
-                    field[b, corner], weight[b, corner], state[b, corner] = d, w, what
-                    corner += 1
+        total[:] = 0.0
+        weighted[:] = 0.0
+        free[:] = 0.0
+        for s in range(len(kind)):
+            n = numbers[s]
+            for part in range(8):
+                # eight smaller blocks of 4 x 4 x 4, so that more of them lie wholly on one side
+                i0, j0, k0 = (part & 1) * 4, (part >> 1 & 1) * 4, (part >> 2) * 4
+                x0, y0, z0 = origins[b, 0] + i0 * step, origins[b, 1] + j0 * step, origins[b, 2] + k0 * step
+                side = side_of_block(
+                    kind[s], n, size[s, 0], size[s, 1], tile_start[s], tile_low, tile_high, flattest,
+                    x0, y0, z0, 3.0 * step, before_mm, behind_mm,
+                )  # fmt: skip
+                if side == BEHIND:
+                    continue
+                for local in range(64):
+                    i, j, k = local & 3, local >> 2 & 3, local >> 4
+                    corner = i0 + i + 8 * (j0 + j) + 64 * (k0 + k)
+                    if side == BEFORE:
+                        free[corner] += free_weight
+                        continue
+                    u, v, r = project(kind[s], n, x0 + i * step, y0 + j * step, z0 + k * step)
+                    known, d, w, _, _, _, _ = look(cells, start[s], size[s, 0], size[s, 1], u, v, r)
+                    if known == 0 or (known == 1 and d > before_mm):
+                        free[corner] += free_weight
+                    elif known == 1 and w > 0.0 and d >= -behind_mm:
+                        # behind the surface the weight falls: what lies there may be another side of something thin
+                        if d < -0.4 * behind_mm:
+                            w *= (d + behind_mm) / (0.6 * behind_mm) + 1e-3
+                        total[corner] += w
+                        weighted[corner] += w * d
+        for corner in range(CORNERS):
+            sum_d = weighted[corner]
+            if total[corner] > 0.0 and (sum_d >= 0.0 or sum_d + free[corner] * before_mm <= 0.0):
+                field[b, corner], state[b, corner] = sum_d / total[corner], SEEN
+            elif free[corner] > 0.0:
+                field[b, corner], state[b, corner] = before_mm, FREE
+            else:
+                field[b, corner], state[b, corner] = -behind_mm, UNKNOWN
 
 
 def fill_blocks(
-    views: Views, origins_mm: FloatArray, step_mm: float, before_mm: float, behind_mm: float
-) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Field, weight (n, 512) float32 and state (n, 512) uint8 at the corners of n blocks of 8 x 8 x 8, x fastest.
+    views: Views, tiles: Tiles, origins_mm: FloatArray, step_mm: float, before_mm: float, behind_mm: float
+) -> tuple[FloatArray, IntArray]:
+    """Field (n, 512) float32 and state (n, 512) uint8 at the corners of n blocks of 8 x 8 x 8, x fastest.
 
-    `before_mm`, `behind_mm`: how far before and behind a surface its distance counts. Unknown corners hold the soft distance:
-    how far behind the last surface they lie, or -inf."""
+    `before_mm`, `behind_mm`: how far before and behind a surface its distance counts. Free corners hold the one, unknown ones minus
+    the other.
+
+    Behind the rim of what a view sees its tangent planes run on into empty space: what they call inside is outside if the views
+    that saw it empty outweigh them, each counting as a typical cell `before_mm` away."""
     n = len(origins_mm)
-    field, weight = np.empty((n, CORNERS), np.float32), np.empty((n, CORNERS), np.float32)
-    state = np.empty((n, CORNERS), np.uint8)
+    field, state = np.empty((n, CORNERS), np.float32), np.empty((n, CORNERS), np.uint8)
+    weight = views.typical_weight
     in_chunks(
         lambda i, j: _fill_blocks(
-            *views.arrays, views.typical_weight, origins_mm, step_mm, before_mm, behind_mm, i, j, field, weight, state
+            *views.arrays,
+            weight,
+            tiles.start,
+            tiles.low,
+            tiles.high,
+            tiles.flattest,
+            origins_mm,
+            step_mm,
+            before_mm,
+            behind_mm,
+            i,
+            j,
+            field,
+            state,
         ),
         n,
         64,
     )
-    return field, weight, state
+    return field, state
 
 
 @kernel
@@ -150,13 +170,20 @@ def _settle(kind, numbers, size, start, cells, points, normals, reach_mm, steps,
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         gx, gy, gz = normals[i, 0], normals[i, 1], normals[i, 2]
         total = 0.0
+        seen_by = (1 << min(len(kind), 63)) - 1
         for _ in range(steps):
             total = sum_d = sum_dd = noise = mx = my = mz = 0.0
             n = 0
             for s in range(len(kind)):
+                if not (seen_by >> min(s, 62)) & 1:
+                    continue
                 u, v, r = project(kind[s], numbers[s], x, y, z)
                 state, d, w, nx, ny, nz, variance = look(cells, start[s], size[s, 0], size[s, 1], u, v, r)
-                if state != 1 or w <= 0.0 or abs(d) > reach_mm:
+                if state != 1 or w <= 0.0 or abs(d) > 2.0 * reach_mm:
+                    if s < 62:
+                        seen_by &= ~(1 << s)
+                    continue
+                if abs(d) > reach_mm:
                     continue
                 length = math.sqrt(nx * nx + ny * ny + nz * nz)
                 agree = (nx * gx + ny * gy + nz * gz) / length

@@ -22,6 +22,7 @@ from rangecheck.surface.meshing.labels import INVENTED_ERROR, thresholds
 from rangecheck.surface.meshing.openings import opened
 from rangecheck.surface.meshing.samples import distance_to_samples, label_faces, sample_grid
 from rangecheck.surface.meshing.shells import shell_of_vertex, shells_to_keep
+from rangecheck.surface.meshing.tiles import Tiles, tiles_of
 from rangecheck.surface.meshing.views import Views, views_of
 from rangecheck.surface.surface import MEASURED, Surface
 
@@ -33,7 +34,7 @@ BEFORE_STEPS, BEHIND_STEPS = 2.5, 2.5
 LEAST_SHELL = 0.02
 #: error left by detail between the samples, as a share of their spacing: what makes the expected errors of scanned busts come true
 UNRESOLVED = 0.015
-OPEN_SWEEPS = 12
+OPEN_SWEEPS = 8
 
 
 def fuse(
@@ -80,26 +81,25 @@ def fuse(
 def _grid_of_distances(views: Views, step: float) -> tuple[Grid, FloatArray]:
     """The sparse grid, filled, closed and free of touching sheets, and the coarse field around it."""
     origin, shape = box_for(views.samples_mm, step)
-    coarse, _ = coarse_field(views, origin, shape, step)
+    tiles = tiles_of(views)
+    coarse, _ = coarse_field(views, tiles, origin, shape, step)
     grid = grid_near(views.samples_mm, origin, shape, step, BEFORE_STEPS * step, _crossed(coarse))
-    _fill(views, grid, coarse, 0)
+    _fill(views, tiles, grid, coarse, 0)
     smooth_open(grid, OPEN_SWEEPS)
     while True:
         more = missing_blocks(grid, coarse)
         if len(more):
             before = len(grid.place)
             add_blocks(grid, more)
-            _fill(views, grid, coarse, before)
+            _fill(views, tiles, grid, coarse, before)
         elif part_touching(grid, coarse) == 0:
             return grid, coarse
 
 
-def _fill(views: Views, grid: Grid, coarse: FloatArray, first: int) -> None:
+def _fill(views: Views, tiles: Tiles, grid: Grid, coarse: FloatArray, first: int) -> None:
     rows = slice(first, len(grid.place))
     before, behind = BEFORE_STEPS * grid.step_mm, BEHIND_STEPS * grid.step_mm
-    grid.field[rows], grid.weight[rows], grid.state[rows] = fill_blocks(
-        views, grid.corner_origins(rows), grid.step_mm, before, behind
-    )
+    grid.field[rows], grid.state[rows] = fill_blocks(views, tiles, grid.corner_origins(rows), grid.step_mm, before, behind)
     fill_open(grid, coarse, rows)
 
 
@@ -135,7 +135,9 @@ def _without_floating_bits(
         return points, faces, origin, error
     a, b, c = (points[faces[:, corner]] for corner in range(3))
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    keep = np.isin(shell, shells_to_keep(shell[faces[:, 0]], area, origin == MEASURED, least_share))
+    wanted = np.zeros(int(shell.max()) + 1, bool)
+    wanted[shells_to_keep(shell[faces[:, 0]], area, origin == MEASURED, least_share)] = True
+    keep = wanted[shell]
     number = np.cumsum(keep) - 1
     kept = keep[faces[:, 0]]
     return points[keep], number[faces[kept]].astype(np.int32), origin[kept], error[keep]

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from rangecheck import rigid
 from rangecheck.arrays import BoolArray, FloatArray, IntArray
@@ -160,13 +159,22 @@ def _mark_hit(kind, numbers, height, width, samples, step, hit):
 
 def _closed_up(mask: BoolArray) -> BoolArray:
     """The mask with its gaps of up to 2 GAP_CELLS closed (dilated, then eroded), its outline unchanged."""
-    side = 2 * GAP_CELLS + 1
     padded: BoolArray = np.pad(mask, 2 * GAP_CELLS)
     for axis in (0, 1):
-        padded = np.asarray(sliding_window_view(padded, side, axis=axis).any(axis=-1))
+        padded = _run(padded, axis, np.logical_or)
     for axis in (0, 1):
-        padded = np.asarray(sliding_window_view(padded, side, axis=axis).all(axis=-1))
+        padded = _run(padded, axis, np.logical_and)
     return padded
+
+
+def _run(mask: BoolArray, axis: int, combine: np.ufunc) -> BoolArray:
+    """Each run of 2 GAP_CELLS + 1 neighbours along `axis`, combined."""
+    ahead = np.moveaxis(mask, axis, 0)
+    count = len(ahead) - 2 * GAP_CELLS
+    out = ahead[:count].copy()
+    for k in range(1, 2 * GAP_CELLS + 1):
+        combine(out, ahead[k : k + count], out=out)
+    return np.moveaxis(out, 0, axis)
 
 
 def _cells_of(scan: RangeScan, pose: FloatArray, known: dict[Camera, tuple[FloatArray, FloatArray]]):
