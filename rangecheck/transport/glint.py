@@ -5,8 +5,8 @@ pixel's four corners and, when the source lies among their mirror directions, ta
 whole pixel, so that a highlight's energy grows with the pixel. `fraction` takes the share of the pixel's mirrored footprint that the source
 fills: the area of the circle inside the polygon of mirrored corners, of the pixel's sixteenths where it matters.
 
-Directions are projected from the surface onto the plane that faces the source (gnomonic), where the source is a circle of radius
-tan(alpha) about the origin.
+Mirror rays are followed to the plane through the source's middle that faces the surface; lengths there are divided by its distance,
+so that the source is a circle of radius tan(alpha) about the origin.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import math
 import numpy as np
 
 from rangecheck.kernels import stage_kernel
-from rangecheck.transport.geometry import place_hit
+from rangecheck.transport.geometry import frame_around, place_hit
 from rangecheck.transport.reflection import spike_of
-from rangecheck.transport.scatter import frame_around, mirror_ray
+from rangecheck.transport.scatter import mirror_ray
 
 #: a pixel whose middle mirrors further than this from a source's rim is taken not to see it: radians
 REACH = 0.5
@@ -66,8 +66,8 @@ def corner_places(glint_pixel, n, width, cells, places):
 
 
 @stage_kernel
-def mirrored_corners(geometry, rays, n, hits, directions):
-    """Mirror directions (n, 3) of cast corner rays; NaN where they met nothing. `hits` is scratch of at least one row."""
+def mirrored_corners(geometry, rays, n, hits, places, directions):
+    """Places and mirror directions (n, 3) of cast corner rays; NaN where they met nothing. `hits` is scratch of at least one row."""
     corners, normals, _, skin = geometry
     for i in range(n):
         if rays.face[i] < 0:
@@ -92,6 +92,8 @@ def mirrored_corners(geometry, rays, n, hits, directions):
         for axis in range(3):
             hits.arriving[0, axis] = rays.direction[i, axis]
         directions[i, 0], directions[i, 1], directions[i, 2] = mirror_ray(hits, 0)
+        for axis in range(3):
+            places[i, axis] = hits.place[0, axis]
 
 
 @stage_kernel
@@ -141,10 +143,10 @@ def _seen_share(corners, radius):
 
 
 @stage_kernel
-def glint_shares(sources, hits, glint_hit, glint_source, n, cells, directions, whole, quad, share):
+def glint_shares(sources, hits, glint_hit, glint_source, n, cells, places, directions, whole, quad, share):
     """share (n,) of each pixel in which the source is mirrored; `whole`: all of it as soon as any, as the report has it.
 
-    directions (n (cells + 1)^2, 3); quad (4, 2) is scratch. A cell without a smooth footprint (its corners meet different things) is
+    places, directions (n (cells + 1)^2, 3); quad (4, 2) is scratch. A cell without a smooth footprint (its corners meet different things) is
     judged by the hit's own mirror ray."""
     each = (cells + 1) * (cells + 1)
     for i in range(n):
@@ -174,13 +176,18 @@ def glint_shares(sources, hits, glint_hit, glint_source, n, cells, directions, w
                     ahead = dx * x + dy * y + dz * z
                     if not ahead > 0.1:
                         whole_quad = False
-                    quad[k, 0] = (dx * ax + dy * ay + dz * az) / ahead
-                    quad[k, 1] = (dx * bx + dy * by + dz * bz) / ahead
+                    px = (places[j, 0] - sources.centre[s, 0]) / distance
+                    py = (places[j, 1] - sources.centre[s, 1]) / distance
+                    pz = (places[j, 2] - sources.centre[s, 2]) / distance
+                    far = -(px * x + py * y + pz * z) / ahead
+                    px, py, pz = px + far * dx, py + far * dy, pz + far * dz
+                    quad[k, 0] = px * ax + py * ay + pz * az
+                    quad[k, 1] = px * bx + py * by + pz * bz
                 seen = _seen_share(quad, radius) if whole_quad else -1.0
                 total += inside if seen < 0.0 else seen
         share[i] = total / (cells * cells)
         if whole:
-            share[i] = 1.0 if share[i] > 0.0 else 0.0
+            share[i] = 1.0 if share[i] > 1e-6 else 0.0
 
 
 @stage_kernel
@@ -188,7 +195,8 @@ def aim_glints(sources, materials, hits, glint_hit, glint_source, share, n, shad
     """Shadow rays to the sources that are mirrored, with what they bring; returns how many."""
     k = np.int64(0)
     for i in range(n):
-        if not share[i] > 0.0:
+        # what is left of rounding is no highlight
+        if not share[i] > 1e-9:
             continue
         hit, s = glint_hit[i], glint_source[i]
         x, y, z = (

@@ -13,6 +13,7 @@ import numpy as np
 from rangecheck.kernels import inline_kernel, stage_kernel
 from rangecheck.scene.sources import form_factor
 from rangecheck.transport.chance import SHADOW, key_of, point
+from rangecheck.transport.geometry import frame_around
 from rangecheck.transport.queues import DIFFUSE
 from rangecheck.transport.reflection import diffuse_of, lobe_of
 
@@ -82,47 +83,39 @@ def aim(sources, materials, hits, start, stop, rays_per_source, with_diffuse, wi
 
 
 @stage_kernel
-def _aim_soft(
-    sources, materials, hits, i, s, x, y, z, distance, rays, diffuse_light, shines, shadows, k
-):  # fmt: skip
-    """Rays spread evenly over the solid angle of source s; together they carry exactly the unshadowed diffuse irradiance."""
+def _aim_soft(sources, materials, hits, i, s, x, y, z, distance, rays, diffuse_light, shines, shadows, k):
+    """Rays to places of source s, which stands wholly above the horizon or is cut by it.
+
+    Above: its directions' tangential parts fill an ellipse evenly (Nusselt 1928), so that every ray carries the same share of the exact
+    irradiance, and only shadows make noise. Cut: rays spread evenly over its solid angle carry their cosines."""
     nx, ny, nz = float(hits.shading[i, 0]), float(hits.shading[i, 1]), float(hits.shading[i, 2])
+    cosine = x * nx + y * ny + z * nz
     sine2 = min(1.0, (sources.radius[s] / distance) ** 2)
+    whole = cosine > 0.0 and cosine * cosine > sine2
     depth = sine2 / (1.0 + math.sqrt(1.0 - sine2))
-    sign = 1.0 if z >= 0.0 else -1.0
-    a = -1.0 / (sign + z)
-    b = x * y * a
+    ax, ay, az, bx, by, bz = frame_around(x, y, z)
     key = key_of(hits.stream[i], SHADOW + s)
-    first, cosines = k, 0.0
     for j in range(rays):
         p, q = point(key, hits.number[i] * rays + j)
-        along = 1.0 - p * depth
-        aside = math.sqrt(max(0.0, 1.0 - along * along))
         turn = 2.0 * math.pi * q
+        along = 1.0 - depth if whole else 1.0 - p * depth
+        aside = math.sqrt(sine2 * p) if whole else math.sqrt(max(0.0, 1.0 - along * along))
         e, f = aside * math.cos(turn), aside * math.sin(turn)
-        # basis around (x, y, z): Duff et al., Building an orthonormal basis, revisited, 2017
-        dx = along * x + e * (1.0 + sign * x * x * a) + f * b
-        dy = along * y + e * sign * b + f * (sign + y * y * a)
-        dz = along * z - e * sign * x - f * y
-        cosine = dx * nx + dy * ny + dz * nz
-        if cosine <= 0.0:
+        dx, dy, dz = along * x + e * ax + f * bx, along * y + e * ay + f * by, along * z + e * az + f * bz
+        up = dx * nx + dy * ny + dz * nz
+        if whole:
+            # the disc's place keeps its tangential part and is lifted to the sphere of directions
+            lift = math.sqrt(max(0.0, 1.0 - (dx * dx + dy * dy + dz * dz - up * up))) - up
+            dx, dy, dz, up = dx + lift * nx, dy + lift * ny, dz + lift * nz, up + lift
+        if up <= 0.0:
             continue
-        reach = distance * (along - math.sqrt(max(0.0, sine2 - aside * aside)))
-        # the cosine waits in `far` until all are known
-        _put_shadow(shadows, k, hits, i, dx, dy, dz, reach, s)
-        shadows.diffuse_share[k] = cosine
-        cosines += cosine
-        k += 1
-    last, k = k, first
-    solid_angle = 2.0 * math.pi * depth
-    for j in range(first, last):
-        cosine = float(shadows.diffuse_share[j])
-        dx, dy, dz = float(shadows.direction[j, 0]), float(shadows.direction[j, 1]), float(shadows.direction[j, 2])
-        lobe_light = cosine * solid_angle / rays if shines else 0.0
-        reach = float(shadows.far[j])
+        light = math.pi * sine2 * cosine / rays if whole else 2.0 * math.pi * depth * up / rays
+        straight = min(1.0, dx * x + dy * y + dz * z)
+        reach = distance * (straight - math.sqrt(max(0.0, sine2 - (1.0 - straight * straight))))
         if _put_gain(
-            shadows, k, hits, i, materials, sources, s, dx, dy, dz, cosine, diffuse_light * cosine / cosines, lobe_light
-        ):
+            shadows, k, hits, i, materials, sources, s, dx, dy, dz, up,
+            light if diffuse_light > 0.0 else 0.0, light if shines else 0.0,
+        ):  # fmt: skip
             _put_shadow(shadows, k, hits, i, dx, dy, dz, reach, s)
             k += 1
     return k

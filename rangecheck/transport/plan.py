@@ -32,7 +32,7 @@ MODELS = ("plan", "full", "report")
 _EACH_SHARE, _ALL_SHARE = 0.2, 0.5
 #: the estimate of the remaining noise is asked to stay this far below what is left
 _NOISE_SHARE = 0.8
-_PILOT_PIXELS, _PILOT_PASSES = 1024, 8
+_PILOT_PIXELS, _PILOT_PASSES = 2048, 8
 _DEPTHS = (1, 2, 3, 4, 6, 10, 16)
 _FULL_DEPTH = 64
 
@@ -147,12 +147,11 @@ class _Planner:
     def __init__(self, tracer: Tracer, picture: PictureRays, tolerance: float, seed: int) -> None:
         self.tracer, self.picture, self.tolerance, self.seed = tracer, picture, tolerance, seed
         order = pixel_order(picture.camera.width, picture.camera.height)
-        # blocks of 4 x 4 pixels here and there: spread over the picture, yet coherent
-        blocks = max(1, len(order) // 16)
-        chosen = np.unique(np.linspace(0, blocks - 1, min(blocks, _PILOT_PIXELS // 16)).astype(int))
-        self.pixels: IntArray = (
-            np.ascontiguousarray((order[: blocks * 16].reshape(blocks, 16)[chosen]).ravel()) if len(order) >= 16 else order
-        )
+        # blocks of 4 x 4 pixels, one from each of many equal stretches of the picture: spread over it, yet coherent
+        blocks, wanted = max(1, len(order) // 16), min(len(order) // 16, _PILOT_PIXELS // 16)
+        places = (np.arange(wanted) + np.random.default_rng(seed).random(wanted)) / max(wanted, 1) * blocks
+        chosen = order[: blocks * 16].reshape(blocks, 16)[places.astype(int)] if wanted else order
+        self.pixels: IntArray = np.ascontiguousarray(chosen.ravel())
         self.reasons: list[str] = []
         self.spent = 0.0
         self.settings = full_settings(tracer)
@@ -189,9 +188,12 @@ class _Planner:
     def _cost(self, without: Settings) -> tuple[float, tuple[FloatArray, FloatArray]]:
         """Relative error of these settings against the present ones, and what they see."""
         seen = self._look(without)
-        product = ((seen[0] - self.seen[0]) * (seen[1] - self.seen[1])).mean(axis=1)
+        first, second = seen[0] - self.seen[0], seen[1] - self.seen[1]
+        product = (first * second).mean(axis=1)
         squared = float(product.mean()) + 2.0 * float(product.std()) / math.sqrt(len(product))
-        return math.sqrt(max(squared, 0.0)) / self.mean, seen
+        # light so rare that the two never meet still shows in the mean
+        mean = 0.5 * float(first.mean() + second.mean())
+        return math.sqrt(max(squared, mean * mean)) / self.mean, seen
 
     def _try(self, name: str, without: Settings, said: str) -> bool:
         """Take `without` if it costs little enough."""

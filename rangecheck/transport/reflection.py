@@ -16,8 +16,22 @@ from rangecheck.arrays import BoolArray, FloatArray
 from rangecheck.kernels import stage_kernel
 from rangecheck.reflectance import Material, stack_tables
 from rangecheck.reflectance.sampling import lobe_density, scattered_direction, scattering_order
-from rangecheck.reflectance.tables import K_LM, K_LOBE, K_SPIKE, REACH, ROUGHNESS, WAVELENGTH_UM, lobe_value, spike_value
+from rangecheck.reflectance.tables import (
+    CORRELATION_UM,
+    K_LM,
+    K_LOBE,
+    K_SPIKE,
+    REACH,
+    ROUGHNESS,
+    SIGMA_UM,
+    WAVELENGTH_UM,
+    lobe_value,
+    spike_value,
+)
 from rangecheck.transport.chance import LOBE_WAY, ORDER, key_of, point
+
+#: roughness g at normal incidence above which a lobe is also drawn from its slopes
+_SEVERAL_ORDERS = 4.0
 
 
 class Materials(NamedTuple):
@@ -72,16 +86,67 @@ def diffuse_of(materials, material, wave):
 
 
 @stage_kernel
-def draw_lobe(materials, material, cosine, key, number):
-    """(x, y, z, density) of a direction drawn for the lobe by scattering order, as `reflectance.sampling` has it: z the normal, the
-    viewer at (s, 0, cosine). z = 0: the draw carries nothing."""
+def _slope_share(materials, material):
+    """With which probability a lobe is drawn from its slopes instead of by scattering order."""
+    roughness = 4.0 * materials.surfaces[material, materials.wave, ROUGHNESS]
+    return 0.5 if roughness > _SEVERAL_ORDERS else 0.0
+
+
+@stage_kernel
+def _slopes(materials, material):
+    """Width of the slopes drawn from: alpha = 2 sigma/T, the rough limit's."""
     row = materials.surfaces[material, materials.wave]
-    wave = materials.wave
-    luck, _ = point(key_of(key, ORDER), number)
+    return 2.0 * row[SIGMA_UM] / row[CORRELATION_UM]
+
+
+@stage_kernel
+def _slope_density(alpha, cos_i, cos_r, toward):
+    """Density per steradian of directions mirrored by facets of Trowbridge and Reitz's slopes, as many as are seen from cos_r."""
+    height2 = 2.0 * (1.0 + toward)
+    both = cos_i + cos_r
+    if not height2 > 0.0:
+        return 0.0
+    cos2 = min(1.0, both * both / height2)
+    spread = alpha * alpha * cos2 + 1.0 - cos2
+    sine2 = max(0.0, 1.0 - cos_r * cos_r)
+    # G1/(4 cos_r), without the cosine in its denominator
+    seen = 1.0 / (2.0 * (cos_r + math.sqrt(cos_r * cos_r + alpha * alpha * sine2)))
+    return seen * alpha * alpha / (math.pi * spread * spread)
+
+
+@stage_kernel
+def draw_lobe(materials, material, cosine, key, number):
+    """(x, y, z, density) of a direction drawn for the lobe: z the normal, the viewer at (s, 0, cosine). z <= 0: it carries nothing.
+
+    By scattering order, as `reflectance.sampling` has it; but seen at grazing angles a surface of several orders scatters upwards far
+    more than its order at the mirror angle says, so half of its directions are mirrored by visible facets instead (Dupuy & Benyoub,
+    *Sampling visible GGX normals with spherical caps*, 2023). The density is that of both together (Veach & Guibas 1995)."""
+    row = materials.surfaces[material, materials.wave]
+    luck, which = point(key_of(key, ORDER), number)
     p, q = point(key_of(key, LOBE_WAY), number)
-    order = scattering_order(4.0 * row[ROUGHNESS] * cosine * cosine, luck, 1)
-    x, y, z = scattered_direction(order, row[REACH], cosine, p, q)
-    if z <= 0.0:
+    sine = math.sqrt(max(0.0, 1.0 - cosine * cosine))
+    share = _slope_share(materials, material)
+    if which < share:
+        alpha = _slopes(materials, material)
+        size = math.sqrt(alpha * alpha * sine * sine + cosine * cosine)
+        vx, vz = alpha * sine / size, cosine / size
+        up = (1.0 - q) * (1.0 + vz) - vz
+        aside = math.sqrt(max(0.0, 1.0 - up * up))
+        hx, hy, hz = alpha * (aside * math.cos(2.0 * math.pi * p) + vx), alpha * aside * math.sin(2.0 * math.pi * p), up + vz
+        size = math.sqrt(hx * hx + hy * hy + hz * hz)
+        if not size > 0.0:
+            return 0.0, 0.0, 0.0, 1.0
+        hx, hy, hz = hx / size, hy / size, hz / size
+        twice = 2.0 * (sine * hx + cosine * hz)
+        x, y, z = twice * hx - sine, twice * hy, twice * hz - cosine
+    else:
+        order = scattering_order(4.0 * row[ROUGHNESS] * cosine * cosine, luck, 1)
+        x, y, z = scattered_direction(order, row[REACH], cosine, p, q)
+    if not z > 0.0:
         return x, y, 0.0, 1.0
-    dx = x + math.sqrt(max(0.0, 1.0 - cosine * cosine))
-    return x, y, z, lobe_density(materials.surfaces, materials.series, material, wave, cosine, z, dx * dx + y * y)
+    dx = x + sine
+    density = lobe_density(materials.surfaces, materials.series, material, materials.wave, cosine, z, dx * dx + y * y)
+    if share > 0.0:
+        slope = _slope_density(_slopes(materials, material), z, cosine, sine * x + cosine * z)
+        density = (1.0 - share) * density + share * slope
+    return x, y, z, density

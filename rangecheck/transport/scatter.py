@@ -13,17 +13,9 @@ import numpy as np
 
 from rangecheck.kernels import stage_kernel
 from rangecheck.transport.chance import BRANCH, CHOICE, DIFFUSE_WAY, key_of, point
+from rangecheck.transport.geometry import frame_around
 from rangecheck.transport.queues import CAMERA, DIFFUSE, LOBE, SPIKE
 from rangecheck.transport.reflection import diffuse_of, draw_lobe, lobe_guess, lobe_of, spike_of
-
-
-@stage_kernel
-def frame_around(z0, z1, z2):
-    """Two unit vectors that make a right-handed frame with the unit vector z (Duff et al. 2017)."""
-    sign = 1.0 if z2 >= 0.0 else -1.0
-    a = -1.0 / (sign + z2)
-    b = z0 * z1 * a
-    return 1.0 + sign * z0 * z0 * a, sign * b, -sign * z0, b, sign + z1 * z1 * a, -z1
 
 
 @stage_kernel

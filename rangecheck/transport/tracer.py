@@ -223,10 +223,10 @@ class _Chunk:
             self._picture.fill(places[0], places[1], rays.origin, rays.direction)
             rays.far[:corners] = np.inf
             self._cast(rays, corners, coherent=True)
-            directions, share = np.empty((corners, 3)), np.empty(len(hit))
-            mirrored_corners(tracer.geometry, rays, corners, work.hits(1, 1), directions)
+            corner, directions, share = np.empty((corners, 3)), np.empty((corners, 3)), np.empty(len(hit))
+            mirrored_corners(tracer.geometry, rays, corners, work.hits(1, 1), corner, directions)
             quad = np.empty((4, 2))
-            glint_shares(tracer.sources, hits, hit, source, len(hit), cells, directions, whole, quad, share)
+            glint_shares(tracer.sources, hits, hit, source, len(hit), cells, corner, directions, whole, quad, share)
             shadows = work.shadows(len(hit))
             k = aim_glints(tracer.sources, tracer.materials, hits, hit, source, share, len(hit), shadows)
             if k:
