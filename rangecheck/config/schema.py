@@ -22,17 +22,22 @@ class Section(BaseModel):
 class Meshing(Section):
     """From scans to one surface."""
 
-    method: Literal["auto", "grid", "fuse", "poisson", "pivot"] = Field("auto", description="how scans become triangles; auto chooses and says why")
+    method: Literal["auto", "grid", "fuse", "poisson", "pivot"] = Field(
+        "auto", description="how scans become triangles; auto chooses and says why"
+    )
     voxel_mm: Positive | None = Field(None, description="edge of a fusion cell; without it, from the scans' own sample spacing")
     max_angle_deg: Annotated[float, Field(gt=0, lt=90)] = Field(
-        80.0, description="a grid triangle whose normal leans further than this from the line of sight is a depth jump and is left out"
+        80.0,
+        description="a grid triangle whose normal leans further than this from the line of sight is a depth jump and is left out",
     )
 
 
 class Solidify(Section):
     """From a surface to a part that can be built."""
 
-    relief_depth_mm: Positive = Field(20.0, description="how far behind its deepest point a relief from one view gets its back plane")
+    relief_depth_mm: Positive = Field(
+        20.0, description="how far behind its deepest point a relief from one view gets its back plane"
+    )
     base: Literal["auto", "none"] = Field("auto", description="auto cuts the bust flat where its lower end is ragged or invented")
     base_height_mm: float | None = Field(None, description="height of the base plane above the lowest point; overrides auto")
     max_move_mm: Positive = Field(0.2, description="how far repair may move any point of the surface; what needs more is refused")
@@ -50,11 +55,18 @@ class Picture(Section):
 class Light(Section):
     """How light is followed."""
 
-    materials: tuple[str, ...] = Field(("plaster", "steel"), description="one turntable each; names of configs/materials or paths of material files")
-    model: Literal["plan", "full", "report"] = Field(
-        "plan", description="plan: as much as the tolerance asks for; full: reference; report: the approximations of the 1991 report"
+    materials: tuple[str, ...] = Field(
+        ("plaster", "steel"), description="one turntable each; names of configs/materials or paths of material files"
     )
-    tolerance_percent: Annotated[float, Field(gt=0, le=50)] = Field(0.5, description="of the frame's mean radiance")
+    model: Literal["direct", "plan", "full", "report"] = Field(
+        "direct",
+        description="direct: sources, shadows, mirrors, no interreflection of matt surfaces; plan: as much as the tolerance asks for; "
+        "full: the reference; report: the approximations of the 1991 report",
+    )
+    samples: Annotated[int, Field(ge=1, le=1024)] = Field(3, description="of every pixel, where the model is direct")
+    tolerance_percent: Annotated[float, Field(gt=0, le=50)] = Field(
+        2.0, description="of the frame's mean radiance, for plan and full"
+    )
 
 
 class Turntable(Section):
@@ -69,9 +81,13 @@ class Turntable(Section):
 class Maps(Section):
     """Distance maps."""
 
-    azimuths_deg: tuple[float, ...] = Field((0.0, 35.0), description="focal points on the orbit from which distance maps are made")
+    azimuths_deg: tuple[float, ...] = Field(
+        (0.0, 35.0), description="focal points on the orbit from which distance maps are made"
+    )
     elevation_deg: Degrees = 20.0
-    contour_step_mm: Positive | None = Field(None, description="depth between contour lines; without it, chosen to give about 25 lines")
+    contour_step_mm: Positive | None = Field(
+        None, description="depth between contour lines; without it, chosen to give about 25 lines"
+    )
 
 
 class Checking(Section):

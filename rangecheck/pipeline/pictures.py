@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,16 +19,17 @@ from rangecheck.pipeline.views import refuse_existing, view_of
 from rangecheck.progress import Reporter
 from rangecheck.reflectance import Material, load_material
 from rangecheck.scene import Scene, Source, gradient, studio
-from rangecheck.transport import Film, Tracer
+from rangecheck.transport import Film, Plan, Tracer, make_plan
 from rangecheck.transport import Settings as LightSettings
+from rangecheck.transport import render as render_film
 
 #: radiance behind the object, where white that faces the key light has 1: an even, dark backdrop, whatever the surroundings
 BACKDROP = 0.05
 
 
-def scene_of(subject: Subject, material: Material) -> Scene:
+def scene_of(subject: Subject, material: Material, *, direct: bool = False) -> Scene:
     """A modelled scene as its file says; any other surface in the studio that suits its material: soft boxes for what mirrors,
-    lamps for what does not."""
+    lamps for what does not - lamps alone where only their `direct` light is followed."""
     surface, model = subject.surface, subject.model
     if model is not None and model.lamps:
         names = list(dict.fromkeys(name or material.name for name in model.material_of_part))
@@ -42,7 +43,8 @@ def scene_of(subject: Subject, material: Material) -> Scene:
             vertex_normals=np.nan_to_num(model.corner_normals),
         )
     strengths = material.strengths().mean(axis=1)
-    return studio(surface, material, "plaster" if strengths[0] > strengths[1:].sum() else "steel", smooth=True)
+    matt = strengths[0] > strengths[1:].sum()
+    return studio(surface, material, ("dark" if direct else "plaster") if matt else "steel", smooth=True)
 
 
 def before_backdrop(film: Film) -> FloatArray:
@@ -50,24 +52,30 @@ def before_backdrop(film: Film) -> FloatArray:
     return film.radiance + (BACKDROP * (1 - film.coverage))[..., None].astype(film.radiance.dtype)
 
 
-@dataclass(frozen=True)
-class LightPlan:
-    """How the light of a scene is followed, and why so."""
-
-    settings: LightSettings
-    reasons: tuple[str, ...] = ()
-
-    def render(self, tracer: Tracer, camera: PinholeCamera, world_from_camera: FloatArray, seed: int) -> Film:
-        """The picture by this plan."""
-        return tracer.render(camera, world_from_camera, self.settings, seed=seed)
-
-    def explain(self) -> list[str]:
-        """Each decision with its reason."""
-        return list(self.reasons)
+def plan_of(tracer: Tracer, camera: PinholeCamera, pose: FloatArray, settings: Settings) -> Plan:
+    """How the light of this picture is followed, and why so; pictures have a backdrop of their own instead of the surroundings."""
+    light = settings.light
+    if light.model == "direct":
+        return _direct_plan(tracer.scene, light.samples)
+    plan = make_plan(tracer, camera, pose, tolerance=light.tolerance_percent / 100, model=light.model, seed=settings.seed)
+    return replace(plan, settings=replace(plan.settings, backdrop=False))
 
 
-def plan_of(tracer: Tracer, camera: PinholeCamera, pose: FloatArray, settings: Settings) -> LightPlan:
-    return LightPlan(LightSettings(passes=4, depth=3, backdrop=False))
+def _direct_plan(scene: Scene, samples: int) -> Plan:
+    """Light straight from the sources, and what surfaces mirror of them, of the surroundings and, once, of each other."""
+    strengths = np.stack([material.strengths() for material in scene.materials])
+    grey = bool((strengths == strengths[..., :1]).all() and not any(material.index_um for material in scene.materials))
+    mirrors = bool(strengths[:, 1:].any())
+    followed = LightSettings(
+        passes=1, each=samples, shadow_rays=0 if mirrors else 1, spike=mirrors, lobe=mirrors, diffuse=False, depth=2 if mirrors else 1,
+        backdrop=False,
+    )  # fmt: skip
+    reasons = (
+        f"direct light: {samples} samples in every pixel, shadows, "
+        + ("one reflection in mirrors" if mirrors else "no interreflection")
+        + "; light.model=plan follows as much light as a tolerance asks for",
+    )
+    return Plan("direct", 0.0, followed, None, grey, reasons)
 
 
 def render(
@@ -88,9 +96,9 @@ def render(
     subject = read_subject(path, settings, unit, reporter)
     camera, pose = view_of(subject, settings, camera_mm)
     with reporter.stage("rendering"):
-        tracer = Tracer(scene_of(subject, material))
+        tracer = Tracer(scene_of(subject, material, direct=settings.light.model == "direct"))
         plan = plan_of(tracer, camera, pose, settings)
-        film = plan.render(tracer, camera, pose, settings.seed)
+        film = render_film(tracer, camera, pose, plan=plan, seed=settings.seed)
     exposure = exposure_from([film.radiance])
     write_png(out, develop(grey_or_colour(before_backdrop(film)), exposure), force=force)
     write_camera_json(Path(out).with_suffix(".camera.json"), camera, pose)

@@ -17,13 +17,13 @@ from rangecheck.export.pictures import develop, exposure_from, png_bytes
 from rangecheck.export.video import FORMATS, find_encoder, write_film
 from rangecheck.optics import PinholeCamera
 from rangecheck.pipeline.outcome import Outcome, document
-from rangecheck.pipeline.pictures import LightPlan, before_backdrop, grey_or_colour, plan_of, scene_of
+from rangecheck.pipeline.pictures import before_backdrop, grey_or_colour, plan_of, scene_of
 from rangecheck.pipeline.subject import Subject, read_subject
 from rangecheck.pipeline.views import camera_of, orbit_of, refuse_existing
 from rangecheck.progress import Reporter
 from rangecheck.reflectance import Material, load_material
 from rangecheck.surface import Surface
-from rangecheck.transport import Tracer
+from rangecheck.transport import Plan, Tracer, render
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class Job:
     material: Material
     camera: PinholeCamera
     orbit: Orbit
-    plan: LightPlan
+    plan: Plan
     seed: int
 
     def key(self) -> dict[str, Any]:
@@ -53,10 +53,10 @@ class Job:
 
 def frames_of(job: Job) -> Callable[[int], FloatArray]:
     """The function of frame numbers that `job` describes; frame i is the same wherever and whenever it is made."""
-    tracer = Tracer(scene_of(Subject(job.material.name, job.surface), job.material))
+    tracer = Tracer(scene_of(Subject(job.material.name, job.surface), job.material, direct=job.plan.model == "direct"))
 
     def frame(index: int) -> FloatArray:
-        film = job.plan.render(tracer, job.camera, job.orbit.world_from_camera(index), job.seed + index)
+        film = render(tracer, job.camera, job.orbit.world_from_camera(index), plan=job.plan, seed=job.seed + index)
         return before_backdrop(film)
 
     return frame
@@ -88,7 +88,7 @@ def render_turntable(
     material = load_material(material_name)
     camera = camera_of(settings)
     with reporter.stage(f"planning light, {material.name}"):
-        tracer = Tracer(scene_of(Subject(material.name, surface), material))
+        tracer = Tracer(scene_of(Subject(material.name, surface), material, direct=settings.light.model == "direct"))
         plan = plan_of(tracer, camera, orbit.world_from_camera(0), settings)
     job = Job(surface, material, camera, orbit, plan, settings.seed)
     with reporter.stage(f"turntable, {material.name}", orbit.frames):
