@@ -182,3 +182,15 @@ def test_the_bunny_is_put_together_without_poses(real_data):
     result = register([scan.moved(rigid.identity()) for scan in truth], guess="none", enough_points=15_000)
     assert result.verdict == "aligned"
     assert np.median(strays_mm(result.scans, truth)) < 0.3
+
+
+def test_a_pose_says_how_well_it_is_known():
+    truth = ring(pebble(1), noise_mm=0.4)
+    result = register(shaken(truth, 3.0, 3.0))
+    strays = strays_mm(result.scans, truth)[1:]
+    expected = np.array([state.pose_error_mm for state in result.states])[1:]
+    assert result.states[0].pose_error_mm == 0
+    # the mean of squares over seven poses of six numbers each, one standard deviation: within a factor of two either way
+    assert 0.5 < np.sqrt(np.mean((strays / expected) ** 2)) < 2.0
+    strict = register(shaken(truth, 3.0, 3.0), most_pose_error_mm=0.5 * float(expected.max()), rescue=False)
+    assert strict.verdict != "aligned" and any("determine its pose only to" in state.reason for state in strict.states)

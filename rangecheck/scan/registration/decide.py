@@ -110,7 +110,7 @@ def _left_free(samples, poses, judged: Judged, pairs, look: int) -> tuple[str, .
 
 
 def aligned_state(
-    k: int, samples: Sequence[Samples], decision: Decision, before: FloatArray, after: FloatArray, note: str
+    k: int, samples: Sequence[Samples], decision: Decision, before: FloatArray, after: FloatArray, note: str, error_mm: float
 ) -> ScanState:
     """The state of member k of a group, all of which were judged in `decision`; its pose was `before` and is `after`."""
     views = [(pair, of_i if i == k else of_j) for (i, j), (pair, of_i, of_j) in decision.judged.items() if k in (i, j)]
@@ -121,6 +121,7 @@ def aligned_state(
     return ScanState(
         samples[k].name, True, note, float(np.any(confirmed, axis=0).mean()),
         float(np.any([v.verdict == INTRUDES for _, v in views], axis=0).mean()), residual, expected, *_motion(samples[k], before, after),
+        (), error_mm,
     )  # fmt: skip
 
 
@@ -134,7 +135,10 @@ def refused_state(name: str, best: Pair | None, objection: str, free: tuple[str,
         reason = objection or "nothing in it looks like anything in the other scans"
         return ScanState(name, False, reason, 0.0, 0.0, math.nan, math.nan, 0.0, 0.0, free)
     partner, overlap = (best.b, best.overlap_a) if best.a == name else (best.a, best.overlap_b)
-    reason = objection or f"with {partner}, its best partner, {best.reason or 'the pair is not joined to the others'}"
+    reason = (
+        objection
+        or f"with {partner}, its best partner, {best.reason or 'it fits, but nothing joins the two to the largest group'}"
+    )
     return ScanState(name, False, reason, overlap, best.intruding, best.residual_mm, best.expected_mm, 0.0, 0.0, free)
 
 

@@ -8,7 +8,7 @@ neighbours in the order of scanning or not. World frame, millimetres.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -24,6 +24,8 @@ _STILL = 2e-3
 _DAMPING = 1e-6
 #: matches below which a pair says nothing
 LEAST_MATCHES = 12
+#: cells of the smallest smoothing window: readings within one err together
+WINDOW_CELLS = 25
 
 
 @dataclass(frozen=True)
@@ -163,3 +165,39 @@ def solve(
         system = a[np.ix_(free, free)] + (hold + _DAMPING) * weight * np.eye(int(free.sum()))
         step[free] = np.linalg.solve(system, -g[free])
     return step
+
+
+def pose_errors_mm(samples: Sequence[Samples], poses: Sequence[FloatArray], fixed: int, count: int = 3000) -> list[float]:
+    """Expected error of each pose relative to scan `fixed`: RMS displacement of the scan's points, one standard deviation.
+
+    From the equations of all pairs at `poses`, each weighted by its own residual. Readings that share a smoothing window err
+    together, so only one of each window counts as evidence. inf where the overlaps leave a motion free."""
+    n = len(samples)
+    targets, moving = [Target(s, 1) for s in samples], [s.spread(count) for s in samples]
+    pairs = [(i, j) for i in range(n) for j in range(n) if i != j]
+    centre, length = frame_of(samples, poses)
+    found = gather(samples, poses, targets, moving, pairs, centre, length)
+    information = np.zeros((6 * n, 6 * n))
+    for (i, j), e in found.items():
+        shared = max(1.0, WINDOW_CELLS * len(moving[i][0]) / max(int(samples[i].inner.sum()), 1))
+        # both directions of a pair look at the same readings
+        weighted = replace(e, normal=e.normal / (2 * shared * e.scale_mm**2))
+        information += assemble({(i, j): weighted}, n)[0]
+    free = np.r_[0 : 6 * fixed, 6 * fixed + 6 : 6 * n]
+    errors = [0.0] * n
+    if len(free) == 0:
+        return errors
+    values, vectors = np.linalg.eigh(information[np.ix_(free, free)])
+    spread = vectors / np.sqrt(np.maximum(values, 1e-12 * max(float(values[-1]), 1e-300)))
+    covariance = spread @ spread.T
+    others = [k for k in range(n) if k != fixed]
+    for place, k in enumerate(others):
+        block = covariance[6 * place : 6 * place + 6, 6 * place : 6 * place + 6]
+        points = rigid.move_points(poses[k], moving[k][0][::10]) - centre
+        # displacement of a point: turn x p / length + shift
+        jacobian = np.zeros((len(points), 3, 6))
+        for axis in range(3):
+            jacobian[:, :, axis] = np.cross(np.eye(3)[axis], points / length)
+            jacobian[:, axis, 3 + axis] = 1.0
+        errors[k] = float(np.sqrt(np.einsum("nij,jk,nik->", jacobian, block, jacobian) / len(points)))
+    return errors

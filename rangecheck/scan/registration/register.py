@@ -23,7 +23,7 @@ from rangecheck.scan.range_scan import RangeScan
 from rangecheck.scan.registration.coarse import FEATURES, TRIALS, Groups, Objection, join_without_guess, levels_for, size_of
 from rangecheck.scan.registration.decide import Decision, aligned_state, decide, refused_state
 from rangecheck.scan.registration.evidence import Pair, Rules
-from rangecheck.scan.registration.joint import align_jointly
+from rangecheck.scan.registration.joint import align_jointly, pose_errors_mm
 from rangecheck.scan.registration.result import Guess, Registration, ScanState
 from rangecheck.scan.registration.samples import ENOUGH_POINTS, Samples, samples_of
 from rangecheck.scan.registration.turntable import Turntable, departure_mm, find_turntable
@@ -49,6 +49,7 @@ def register(
     most_intruding: float = 0.03,
     agree_mm: float | None = None,
     most_excess: float = 8.0,
+    most_pose_error_mm: float | None = None,
     enough_points: int = ENOUGH_POINTS,
     features: int = FEATURES,
     trials: int = TRIALS,
@@ -63,13 +64,15 @@ def register(
     angles_deg  turntable: angle of each scan (n,), without it equal steps of a full turn; their sense is found
     axis_direction, axis_point_mm  turntable: in the world, without them the picture's upward direction, and searched for
     least_overlap, least_consistency, most_intruding, agree_mm, most_excess  see `Rules`; without a guess overlap must be at least 0.2, consistency 0.85, and excess at most 5
+    most_pose_error_mm  expected error beyond which a pose is refused; without it a quarter of the scan's sample spacing, or three times
+                what noise leaves in its smoothed points if that is more; a turntable's own poses are not held to it
     enough_points  points per scan beyond which its grid is thinned
     features, trials  of the search without a guess: points described per scan, motions tried per pair
 
     Raises ScanError when there is no scan or one has no surface; SettingError for a setting out of its range. A pose that
     cannot be defended is no error but a state: see `Registration.states`."""
     rules = Rules(least_overlap, least_consistency, most_intruding, agree_mm, most_excess)
-    _check(scans, guess, rules, reach_mm, features, trials, enough_points)
+    _check(scans, guess, rules, reach_mm, features, trials, enough_points, most_pose_error_mm)
     n = len(scans)
     samples: list[Samples] = in_chunks(lambda i, _: samples_of(scans[i], enough=enough_points), n, 1)
     given = [np.array(s.world_from_scan, dtype=float) for s in scans]
@@ -120,10 +123,31 @@ def register(
         groups, ties, more_objections = join_without_guess(samples, groups, strict, seed=seed, trials=trials, features=features)
         tried += [tie.pair for tie in ties]
         objections += more_objections
-    # a turntable's poses that held to the last scan need no other support; those found without it do
     settled = decision if guess != "none" and len(held) == n else None
-    main, poses, decided, more = _settle(samples, groups, rules, hold if len(held) == n else 0.0, settled)
-    iterations += more
+    # a turntable's poses that held to the last scan need no other support; those found without it do
+    hold = hold if len(held) == n else 0.0
+    unsure: dict[int, str] = {}
+    while True:
+        main, poses, decided, more = _settle(samples, groups, rules, hold, settled)
+        iterations += more
+        errors = dict.fromkeys(main, math.nan)
+        if decided is None or hold > 0:
+            break
+        kept = anchor if anchor in main else main[0]
+        local = [samples[k] for k in main]
+        errors = dict(zip(main, pose_errors_mm(local, [poses[k] for k in main], main.index(kept))))
+        limits = {k: _allowed_error(samples[k], most_pose_error_mm) for k in main}
+        loose = [k for k in main if errors[k] > limits[k]]
+        if not loose:
+            break
+        for k in loose:
+            unsure[k] = (
+                f"its overlaps determine its pose only to {errors[k]:.2f} mm (one standard deviation; at most {limits[k]:.2f})"
+            )
+        groups = Groups(
+            [n + k if k in loose else g for k, g in enumerate(groups.group)], [poses.get(k, p) for k, p in enumerate(groups.pose)]
+        )
+        settled = None
     anchor = anchor if anchor in main else main[0]
     back = given[anchor] @ rigid.inverse(poses[anchor])
     poses = {k: rigid.checked(back @ pose) for k, pose in poses.items()}
@@ -132,13 +156,12 @@ def register(
     for k in range(n):
         if decided is not None and k in main:
             note = "" if guess == "none" or k in held else "its guess did not hold; its pose was found without one"
-            local = [samples[m] for m in main]
-            states.append(aligned_state(main.index(k), local, decided, given[k], poses[k], note))
+            states.append(aligned_state(main.index(k), [samples[m] for m in main], decided, given[k], poses[k], note, errors[k]))
         else:
-            text = ""
+            text = unsure.get(k, "")
             motions: tuple[str, ...] = ()
             for o in objections:
-                if k in (o.a, o.b):
+                if k in (o.a, o.b) and not text:
                     text, motions = f"with {scans[o.b if o.a == k else o.a].name}, {o.reason}", o.free
                     break
             states.append(refused_state(scans[k].name, _best_of(scans[k].name, tried), text, motions))
@@ -182,6 +205,10 @@ def _settle(
     return main, {main[0]: groups.pose[main[0]]}, None, total
 
 
+def _allowed_error(samples: Samples, most_mm: float | None) -> float:
+    return most_mm if most_mm is not None else max(0.25 * samples.spacing_mm, 3 * samples.smooth_mm)
+
+
 def _best_of(name: str, tried: Sequence[Pair]) -> Pair | None:
     """The pair of a scan that comes nearest to being accepted."""
     mine = [p for p in tried if name in (p.a, p.b)]
@@ -200,7 +227,7 @@ def _turntable(samples, world_from_first, rules, angles_deg, axis_direction, axi
     )
 
 
-def _check(scans, guess, rules: Rules, reach_mm, features, trials, enough_points) -> None:
+def _check(scans, guess, rules: Rules, reach_mm, features, trials, enough_points, most_pose_error_mm) -> None:
     if not scans:
         raise ScanError("there are no scans to register; give at least one")
     names = [s.name for s in scans]
@@ -215,6 +242,7 @@ def _check(scans, guess, rules: Rules, reach_mm, features, trials, enough_points
         ("most_intruding", rules.most_intruding, 0.0, 1.0),
         ("most_excess", rules.most_excess, 0.0, math.inf),
         ("agree_mm", rules.agree_mm, 0.0, math.inf),
+        ("most_pose_error_mm", most_pose_error_mm, 0.0, math.inf),
         ("reach_mm", reach_mm, 0.0, math.inf),
         ("features", features, 50, 20_000),
         ("trials", trials, 1, 10_000_000),

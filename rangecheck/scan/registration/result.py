@@ -30,6 +30,8 @@ class ScanState:
     expected_mm  what noise alone would leave of it
     moved_mm, turned_deg  motion from the pose it came with: of the middle of its points, and its rotation
     undetermined motions that its overlap leaves free, in words
+    pose_error_mm expected error of its pose relative to the scan that kept its own: RMS displacement of its points, one standard
+                  deviation, from noise and the shape of the overlaps; what a scanner's calibration adds is not in it
     """
 
     name: str
@@ -42,6 +44,7 @@ class ScanState:
     moved_mm: float
     turned_deg: float
     undetermined: tuple[str, ...] = ()
+    pose_error_mm: float = math.nan
 
 
 @dataclass(frozen=True, eq=False)
