@@ -94,7 +94,7 @@ def test_the_table_stays_within_its_stated_error_of_the_series():
     assert error.max() < FAST_ERROR
     # where the lobe carries light at all it is much closer, on which the energy bound's margin rests
     bright = a[normal] < 10 * (1 + g[normal])
-    assert error[bright].max() < 5e-5
+    assert error[bright].max() < 1e-4
 
 
 @pytest.mark.parametrize("g", [0.0, 1e-300, 1e-20, 2.0**-40, 1.0, 2.0**27, 1e9, 1e30])
