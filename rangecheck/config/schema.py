@@ -63,7 +63,7 @@ class Light(Section):
         description="direct: sources, shadows, mirrors, no interreflection of matt surfaces; plan: as much as the tolerance asks for; "
         "full: the reference; report: the approximations of the 1991 report",
     )
-    samples: Annotated[int, Field(ge=1, le=1024)] = Field(3, description="of every pixel, where the model is direct")
+    samples: Annotated[int, Field(ge=1, le=1024)] = Field(2, description="of every pixel, where the model is direct")
     tolerance_percent: Annotated[float, Field(gt=0, le=50)] = Field(
         2.0, description="of the frame's mean radiance, for plan and full"
     )
