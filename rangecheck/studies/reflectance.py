@@ -32,7 +32,7 @@ SURFACES = ((0.02, 3.0), (0.1, 3.0), (0.2, 3.0), (1.0, 10.0), (2.0, 6.0))
 
 
 def study(quick: bool = False) -> Study:
-    """The whole study; `quick` takes fewer points and rounds, for a first look (about 10 s instead of a minute)."""
+    """The whole study; `quick` takes fewer points and rounds, for a first look (10 s instead of a minute on two idle cores, of which most is quadrature)."""
     speed, forms_table = _forms(points=60 if quick else 200, evaluations=5_000 if quick else 50_000, rounds=5 if quick else 15)
     limits = _limits(25 if quick else 81)
     grazing, grazing_rows = _grazing(24 if quick else 60)
@@ -287,7 +287,7 @@ def _changes(steps: int) -> tuple[list[LineChart], list[dict[str, Any]]]:
         lines = []
         for words, (masking, bounded) in variants.items():
             lobe = lobe_albedo(np.cos(theta), roughness, reach, masking=MASKINGS[masking], bounded=bounded)
-            lines.append(Line(words, degrees.tolist(), np.minimum(lobe + spike, _DRAWN_UP_TO).tolist()))
+            lines.append(Line(words, degrees.tolist(), np.where(lobe + spike > _DRAWN_UP_TO, np.nan, lobe + spike).tolist()))
             rows += [
                 {"sigma_um": sigma, "correlation_um": correlation, "variant": words, "degrees": float(d), "albedo": float(v)}
                 for d, v in zip(degrees, lobe + spike)
