@@ -1,0 +1,40 @@
+"""Every command in README works as it stands there, in order, and every picture and path that it names exists."""
+
+import re
+import shlex
+from pathlib import Path
+
+from rangecheck_cli.main import exit_status
+
+ROOT = Path(__file__).resolve().parent.parent
+README = (ROOT / "README.md").read_text()
+
+
+def test_every_command_in_readme_works(tmp_path, monkeypatch):
+    for folder in ("sample_data", "configs"):
+        (tmp_path / folder).symlink_to(ROOT / folder)
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"^```console\n(.*?)^```", README, re.S | re.M)
+    commands = [line[2:] for block in blocks for line in block.splitlines() if line.startswith("$ ")]
+    assert len(commands) > 12
+    for command in commands:
+        program, *arguments = shlex.split(command)
+        assert program == "rangecheck"
+        # a small job's verdict may be that it is not fit; what must not happen is that a command fails
+        assert exit_status([*arguments, "-q"]) in ((0, 1) if arguments[0] in ("run", "check") else (0,)), command
+
+
+def test_every_picture_in_readme_exists():
+    pictures = re.findall(r"!\[[^]]*\]\(([^)]+)\)", README)
+    assert pictures
+    for picture in pictures:
+        assert (ROOT / picture).is_file(), picture
+
+
+def test_every_room_of_the_map_exists():
+    rows = re.findall(r"^\| (`[^|]+`) \|", README, re.M)
+    rooms = [room for row in rows for room in re.findall(r"`([a-z]+)/?`", row)]
+    assert len(rooms) > 15
+    for room in rooms:
+        place = ROOT / "cli" if room == "cli" else ROOT / "rangecheck" / room
+        assert place.is_dir() or place.with_suffix(".py").is_file(), room
