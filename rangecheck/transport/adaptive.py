@@ -6,8 +6,9 @@ radiance. What one sample may be off is judged by how its pixel departs from the
 what a group of evenly spread samples may be off, by the spread of the groups, shared among neighbours. Samples are allotted in
 proportion to that spread (Neyman 1934), which gives the least error for their number.
 
-m groups of samples that are spread evenly together err less than m independent ones: their variance falls about as m^-1.5 at an edge and
-as m^-1 where noise has many dimensions. m^-1.25 is assumed.
+The variance of m groups of samples that are spread evenly together falls about as m^-1.5 at an edge, of which m^-1.25 is assumed, and as
+m^-1 where light is gathered by chance. There a single sample says nothing about its error (it may by chance have met no light at all), so
+that every pixel that sees a surface gets two groups before anything is judged.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ EACH = 4
 _QUIET = 0.1
 #: groups per pixel at most grow so much from one round to the next, because their number rests on an estimate
 _GROWTH = 4
-#: how the variance of a pixel falls with its number of groups
-_DECAY = 1.25
+#: how the variance of a pixel falls with its number of groups: without and with chance in the gathering
+_DECAY_OF_EDGES, _DECAY_OF_NOISE = 1.25, 1.0
 
 
 def render_to(
@@ -69,6 +70,9 @@ def _refine(
 ) -> None:
     prior = np.empty(len(pixels), np.float32)
     _unevenness(plate.mean, *plate.shape, prior)
+    by_chance = settings.lobe or settings.diffuse
+    decay = _DECAY_OF_NOISE if by_chance else _DECAY_OF_EDGES
+    least = _near_surfaces(plate.covered, plate.shape) * np.int32(2 if by_chance else 0)
     groups, spread = np.zeros(len(pixels), np.int32), np.empty(len(pixels), np.float32)
     while True:
         mean = float(plate.mean.mean(dtype=np.float64))
@@ -76,7 +80,7 @@ def _refine(
         if not allowed > 0:
             return
         _group_variance(plate.spread, groups, prior, *plate.shape, spread)
-        wanted = _allot(prior, spread, groups, allowed, max(2, most // EACH))
+        wanted = np.maximum(_allot(prior, spread, groups, allowed, max(2, most // EACH), decay), least)
         more = pixels[(wanted > groups)[pixels]]
         if not len(more):
             return
@@ -88,7 +92,14 @@ def _refine(
         groups[more] = wanted[more]
 
 
-def _allot(prior: FloatArray, spread: FloatArray, groups: IntArray, allowed: float, most: int) -> IntArray:
+def _near_surfaces(covered: FloatArray, shape: tuple[int, int]) -> IntArray:
+    """(n,) int32 1 where a pixel or a neighbour met a surface."""
+    met = np.pad(covered.reshape(shape) > 0, 1)
+    wide = met[:, :-2] | met[:, 1:-1] | met[:, 2:]
+    return np.asarray((wide[:-2] | wide[1:-1] | wide[2:]).ravel(), np.int32)
+
+
+def _allot(prior: FloatArray, spread: FloatArray, groups: IntArray, allowed: float, most: int, decay: float) -> IntArray:
     """(n,) groups that every pixel should have, at least those it has, so that the mean squared error is `allowed`."""
     wanted = groups.copy()
     noisy = np.flatnonzero((groups > 0) | (prior > (_QUIET**2) * allowed))
@@ -101,13 +112,13 @@ def _allot(prior: FloatArray, spread: FloatArray, groups: IntArray, allowed: flo
     highest = np.minimum(most, np.maximum(2, _GROWTH * now))
 
     def number(step: float) -> IntArray:
-        ideal = np.ceil(np.minimum((deviation / step) ** (2 / (1 + _DECAY)), float(most)))
+        ideal = np.ceil(np.minimum((deviation / step) ** (2 / (1 + decay)), float(most)))
         # one group tells nothing of its spread, and a pixel that needs less than one keeps its single sample
         ideal = np.where(ideal > 1, ideal, np.where((now == 0) & (single <= deviation * step), 0, 2))
         return np.maximum(now, np.minimum(ideal, highest)).astype(np.int32)
 
     def remains(count: IntArray) -> float:
-        return float(np.where(count > 0, spread[noisy] / np.maximum(count, 1.0) ** _DECAY, single).sum())
+        return float(np.where(count > 0, spread[noisy] / np.maximum(count, 1.0) ** decay, single).sum())
 
     if remains(now) <= left:
         return wanted
@@ -141,7 +152,7 @@ def _unevenness(mean, height, width, prior):
 
 @stage_kernel
 def _group_variance(spread, groups, prior, height, width, variance):
-    """Variance of one group's mean: pooled over the pixel and its eight neighbours, with the first guess as one more voice."""
+    """Variance of one group's mean: pooled over the 5 x 5 pixels around, with the first guess as one more voice."""
     channels = spread.shape[1]
     for row in range(height):
         for column in range(width):
@@ -149,11 +160,11 @@ def _group_variance(spread, groups, prior, height, width, variance):
             # four rays spread evenly over an edge are off by an eighth of what one is
             total, voices = 0.125 * prior[pixel], 1.0
             if groups[pixel] > 1:
-                for r in range(max(row - 1, 0), min(row + 2, height)):
-                    for c in range(max(column - 1, 0), min(column + 2, width)):
+                for r in range(max(row - 2, 0), min(row + 3, height)):
+                    for c in range(max(column - 2, 0), min(column + 3, width)):
                         near = r * width + c
                         if groups[near] > 1:
-                            share = 4.0 if near == pixel else 1.0
+                            share = 8.0 if near == pixel else 1.0
                             for k in range(channels):
                                 total += share * spread[near, k] / channels
                             voices += share * (groups[near] - 1)

@@ -32,6 +32,8 @@ from rangecheck.transport.chance import LOBE_WAY, ORDER, key_of, point
 
 #: roughness g at normal incidence above which a lobe is also drawn from its slopes
 _SEVERAL_ORDERS = 4.0
+#: probability with which the order is that of light from the zenith
+_STEEP_SHARE = 0.2
 
 
 class Materials(NamedTuple):
@@ -89,7 +91,7 @@ def diffuse_of(materials, material, wave):
 def _slope_share(materials, material):
     """With which probability a lobe is drawn from its slopes instead of by scattering order."""
     roughness = 4.0 * materials.surfaces[material, materials.wave, ROUGHNESS]
-    return 0.5 if roughness > _SEVERAL_ORDERS else 0.0
+    return 0.4 if roughness > _SEVERAL_ORDERS else 0.0
 
 
 @stage_kernel
@@ -118,9 +120,10 @@ def _slope_density(alpha, cos_i, cos_r, toward):
 def draw_lobe(materials, material, cosine, key, number):
     """(x, y, z, density) of a direction drawn for the lobe: z the normal, the viewer at (s, 0, cosine). z <= 0: it carries nothing.
 
-    By scattering order, as `reflectance.sampling` has it; but seen at grazing angles a surface of several orders scatters upwards far
-    more than its order at the mirror angle says, so half of its directions are mirrored by visible facets instead (Dupuy & Benyoub,
-    *Sampling visible GGX normals with spherical caps*, 2023). The density is that of both together (Veach & Guibas 1995)."""
+    By scattering order, as `reflectance.sampling` has it. But seen at grazing angles a surface scatters upwards far more often than its
+    order at the mirror angle says: so some directions are drawn with the order that light from the zenith would have, and on surfaces
+    of several orders some are mirrored by visible facets (Dupuy & Benyoub, *Sampling visible GGX normals with spherical caps*, 2023).
+    The density is that of all together (Veach & Guibas 1995), so that no weight grows large."""
     row = materials.surfaces[material, materials.wave]
     luck, which = point(key_of(key, ORDER), number)
     p, q = point(key_of(key, LOBE_WAY), number)
@@ -140,13 +143,16 @@ def draw_lobe(materials, material, cosine, key, number):
         twice = 2.0 * (sine * hx + cosine * hz)
         x, y, z = twice * hx - sine, twice * hy, twice * hz - cosine
     else:
-        order = scattering_order(4.0 * row[ROUGHNESS] * cosine * cosine, luck, 1)
+        cosines = 1.0 + cosine if which < share + _STEEP_SHARE else 2.0 * cosine
+        order = scattering_order(row[ROUGHNESS] * cosines * cosines, luck, 1)
         x, y, z = scattered_direction(order, row[REACH], cosine, p, q)
     if not z > 0.0:
         return x, y, 0.0, 1.0
     dx = x + sine
-    density = lobe_density(materials.surfaces, materials.series, material, materials.wave, cosine, z, dx * dx + y * y)
+    aside = dx * dx + y * y
+    flat = lobe_density(materials.surfaces, materials.series, material, materials.wave, cosine, z, aside)
+    steep = lobe_density(materials.surfaces, materials.series, material, materials.wave, 0.5 * (1.0 + cosine), z, aside)
+    density = (1.0 - share - _STEEP_SHARE) * flat + _STEEP_SHARE * steep
     if share > 0.0:
-        slope = _slope_density(_slopes(materials, material), z, cosine, sine * x + cosine * z)
-        density = (1.0 - share) * density + share * slope
+        density += share * _slope_density(_slopes(materials, material), z, cosine, sine * x + cosine * z)
     return x, y, z, density
