@@ -26,6 +26,7 @@ COMMANDS = {
     "decode": "Turn structured-light pictures into a range scan.",
     "draw": "Line drawing of a modelled scene, hidden lines removed.",
     "sample": "Make the sample scans again, byte for byte.",
+    "study": "Chart speed against accuracy, and find where methods break.",
     "materials": "List materials, plot their lobes, print their energy table.",
     "explain": "Say what a finding means, why it matters and what mends it.",
     "doctor": "Say what is installed, what is missing, and the line that mends it.",

@@ -24,6 +24,7 @@ _WHERE = {
     "sample": "shape",
     "simulate": "shape",
     "solid": "shape",
+    "study": "inspect",
     "turntable": "turning",
 }
 

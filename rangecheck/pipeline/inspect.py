@@ -115,3 +115,53 @@ def explain(code: str | None) -> Outcome:
         document("explain", **vars(entry)),
         [f"{entry.code} ({entry.severity}): {entry.title}", f"why:  {entry.why}", f"mend: {entry.mend}"],
     )
+
+
+def materials(names: Sequence[str], out: str | None, *, force: bool, reporter: Reporter) -> Outcome:
+    """Each material's numbers, source and energy table; with `out`, a polar plot of each there."""
+    from rangecheck.files import write_bytes
+    from rangecheck.reflectance import energy_table, load_material, material_names, polar_chart
+
+    lines: list[str] = []
+    found: list[dict[str, Any]] = []
+    for name in names or material_names():
+        material = load_material(name)
+        with reporter.stage(f"energy of {material.name}"):
+            rows = energy_table(material)
+        lines.append(f"{material.name}: {material.description}")
+        lines.append(f"  sigma {material.sigma_um:g} um, T {material.correlation_um:g} um; {material.source}")
+        lines += [f"  beware: {concern}" for concern in material.concerns()]
+        lines.append("  wavelength  angle  diffuse  spike   lobe    total   as published")
+        lines += [
+            f"  {row['wavelength_um']:>7.3f} um {row['degrees']:>5.1f}  {row['diffuse']:.4f}   {row['spike']:.4f}  {row['lobe']:.4f}  "
+            f"{row['total']:.4f}  {row['published']:.4f}"
+            for row in rows
+        ]
+        if out:
+            write_bytes(Path(out) / f"{material.name}.svg", polar_chart(material), force=force)
+        found.append(
+            {
+                "name": material.name,
+                "description": material.description,
+                "source": material.source,
+                "sigma_um": material.sigma_um,
+                "correlation_um": material.correlation_um,
+                "concerns": material.concerns(),
+                "energy": rows,
+            }
+        )
+    return Outcome(document("materials", materials=found), lines)
+
+
+def study(name: str, out: str, *, quick: bool, force: bool, reporter: Reporter) -> Outcome:
+    """A study of speed against accuracy and of stability, made again on this machine; charts and numbers in `out`."""
+    from rangecheck.pipeline.folder import check_writable
+    from rangecheck.studies import study_named
+    from rangecheck.study import write_study
+
+    make = study_named(name)
+    check_writable(out)
+    with reporter.stage(f"study of {name}"):
+        made = make(quick=quick)
+    written = write_study(made, out, force=force)
+    return Outcome(made.document(), [f"{made.title}", *made.findings, *(str(path) for path in written)])
