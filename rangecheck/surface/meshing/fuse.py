@@ -32,8 +32,9 @@ VOXEL_IN_SPACINGS = 1.0
 BEFORE_STEPS, BEHIND_STEPS = 2.5, 2.5
 #: shells with less than this share of the largest shell's measured area are floating bits
 LEAST_SHELL = 0.02
-#: error left by detail between the samples, as a share of their spacing: what makes the expected errors of scanned busts come true
-UNRESOLVED = 0.015
+#: error left by detail between the samples, as a share of their spacing, and a factor on the sum: with these two, 68 and 95 % of the
+#: true errors lay within one and two expected ones on simulated scans of three busts at noises of 0.05, 0.2 and 0.5 mm
+UNRESOLVED, ERROR_FACTOR = 0.015, 0.955
 OPEN_SWEEPS = 8
 
 
@@ -122,7 +123,7 @@ def _settle(views: Views, points: FloatArray, normals: FloatArray, low: FloatArr
     moved, directions = points[chosen], normals[chosen]
     box_low, box_high = low[chosen] + MARGIN * step, low[chosen] + (1 - MARGIN) * step
     noise, _ = settle(views, moved, directions, 1.5 * step, box_low, box_high)
-    error[chosen] = np.hypot(noise, UNRESOLVED * views.spacing_mm)
+    error[chosen] = ERROR_FACTOR * np.hypot(noise, UNRESOLVED * views.spacing_mm)
     points[chosen], normals[chosen] = moved, directions
     return error
 

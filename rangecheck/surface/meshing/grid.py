@@ -12,9 +12,10 @@ import math
 import numpy as np
 
 from rangecheck import rigid
-from rangecheck.arrays import FloatArray, IntArray
+from rangecheck.arrays import FloatArray, IntArray, unit_vectors
 from rangecheck.errors import SettingError, SurfaceError
 from rangecheck.kernels import kernel
+from rangecheck.optics import PinholeCamera
 from rangecheck.scan import RangeScan
 from rangecheck.surface.meshing.local_fit import COSINE_CLASSES, noise_by_obliquity
 from rangecheck.surface.surface import Surface
@@ -131,10 +132,12 @@ def grid_mesh(scan: RangeScan, *, max_angle_deg: float = 80.0, noise_mm: float |
     scan.need_points()
     noise = scan.noise_mm if noise_mm is None else noise_mm
     height, width = scan.range_mm.shape
-    _, directions = scan.camera.pixel_rays()
-    points, rays = scan.grid_points_mm.reshape(-1, 3), np.ascontiguousarray(directions).reshape(-1, 3)
+    points = scan.grid_points_mm.reshape(-1, 3)
+    # where all rays start in the origin, points lie along them; only directions count
+    rays = points if isinstance(scan.camera, PinholeCamera) else np.ascontiguousarray(scan.camera.pixel_rays()[1]).reshape(-1, 3)
     valid = scan.valid.ravel()
-    faces = np.empty((2 * max(height - 1, 0) * max(width - 1, 0), 3), np.int32)
+    # the lowest corner of a triangle's square, or the cell to its right, is valid
+    faces = np.empty((4 * int(valid.sum()), 3), np.int32)
     count = _triangles(
         points, rays, valid, height, width, math.sin(math.radians(max_angle_deg)), NOISE_STEPS * (noise or 0.0), faces
     )
@@ -170,7 +173,7 @@ def _errors(
     if noise is not None:
         return np.full(len(points), float(noise))
     cosine = np.empty(len(points))
-    _cosines(points, rays, faces, cosine)
+    _cosines(points, unit_vectors(rays), faces, cosine)
     rough = np.empty(scan.range_mm.shape)
     _roughness(scan.range_mm.astype(np.float64), rough)
     classes = noise_by_obliquity(rough.ravel()[used], cosine, None)
