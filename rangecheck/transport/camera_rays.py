@@ -15,7 +15,7 @@ from rangecheck.arrays import FloatArray, IntArray
 from rangecheck.kernels import inline_kernel, stage_kernel
 from rangecheck.optics import Camera, OrthographicCamera, PinholeCamera
 from rangecheck.transport.chance import PIXEL, key_of, point, stream_of
-from rangecheck.transport.queues import CAMERA
+from rangecheck.transport.queues import CAMERA, Rays
 
 TILE, BLOCK = 64, 4
 
@@ -55,6 +55,19 @@ class PictureRays:
         else:
             self._numbers = np.empty(0)
 
+    def start(
+        self, pixels: IntArray, numbers: IntArray, each: int, centre: bool, seed: int, places: FloatArray, rays: Rays
+    ) -> None:
+        """Start `each` rays of group numbers[i] through each of the pixels, spread evenly over it, or through its middle. `places`
+        (2, n each) is room for their pixel coordinates."""
+        seed &= 0xFFFFFFFF
+        width = self.camera.width
+        if len(self._numbers) and self._numbers[0] == 0.0:
+            _start_pinhole(self._numbers, self.rotation, self.eye, pixels, numbers, width, each, centre, seed, rays)
+        else:
+            _start_rays(pixels, numbers, width, each, centre, seed, places, rays)
+            self.fill(places[0], places[1], rays.origin, rays.direction)
+
     def fill(self, u: FloatArray, v: FloatArray, origins: FloatArray, directions: FloatArray) -> None:
         """Write the rays at pixel coordinates u, v (n,) float64 into origins and directions (n, 3) float32."""
         if len(self._numbers):
@@ -66,8 +79,19 @@ class PictureRays:
         )
 
 
+@inline_kernel
+def _begin(rays, k, i, each, stream, number):
+    """Ray k begins a path that carries its share of all the light to sample i."""
+    rays.far[k] = math.inf
+    rays.pixel[k] = i
+    rays.stream[k], rays.number[k] = stream, number
+    rays.kind[k] = rays.first[k] = CAMERA
+    for c in range(rays.weight.shape[1]):
+        rays.weight[k, c] = 1.0 / each
+
+
 @stage_kernel
-def start_rays(pixels, numbers, width, each, centre, seed, places, rays):
+def _start_rays(pixels, numbers, width, each, centre, seed, places, rays):
     """Pixel coordinates places (2, n each) of group numbers[i] of `each` samples of pixel i, and rays that together carry all the
     light that they find. The samples of one group are spread evenly over the pixel; `centre` puts a single one in its middle."""
     k = np.int64(0)
@@ -81,12 +105,7 @@ def start_rays(pixels, numbers, width, each, centre, seed, places, rays):
                 x, y = point(key_of(stream, PIXEL), numbers[i] * each + j)
                 places[0, k] += x - 0.5
                 places[1, k] += y - 0.5
-            rays.far[k] = math.inf
-            rays.pixel[k] = i
-            rays.stream[k], rays.number[k] = stream, numbers[i] * each + j
-            rays.kind[k] = rays.first[k] = CAMERA
-            for c in range(rays.weight.shape[1]):
-                rays.weight[k, c] = 1.0 / each
+            _begin(rays, k, i, each, stream, numbers[i] * each + j)
             k += 1
 
 
@@ -124,3 +143,33 @@ def _moved_rays(places, rays, rotation, eye, origins, directions):
         _put_ray(
             rotation, eye, places[i, 0], places[i, 1], places[i, 2], rays[i, 0], rays[i, 1], rays[i, 2], origins, directions, i
         )
+
+
+@stage_kernel
+def _start_pinhole(camera, rotation, eye, pixels, numbers, width, each, centre, seed, rays):
+    """`_start_rays` and `_simple_rays` in one pass, for the camera that most pictures are taken with."""
+    origin, direction = rays.origin, rays.direction
+    fx, fy, cx, cy = 1.0 / camera[1], 1.0 / camera[2], camera[3], camera[4]
+    ax, ay, az = rotation[0, 0], rotation[1, 0], rotation[2, 0]
+    bx, by, bz = rotation[0, 1], rotation[1, 1], rotation[2, 1]
+    gx, gy, gz = rotation[0, 2], rotation[1, 2], rotation[2, 2]
+    ex, ey, ez = eye[0], eye[1], eye[2]
+    k = np.int64(0)
+    for i in range(len(pixels)):
+        pixel = pixels[i]
+        row = pixel // width
+        stream = stream_of(seed, pixel)
+        for j in range(each):
+            u, v = float(pixel - row * width), float(row)
+            if not centre:
+                p, q = point(key_of(stream, PIXEL), numbers[i] * each + j)
+                u, v = u + p - 0.5, v + q - 0.5
+            x, y = (u - cx) * fx, (v - cy) * fy
+            dx, dy, dz = x * ax + y * bx + gx, x * ay + y * by + gy, x * az + y * bz + gz
+            size = 1.0 / math.sqrt(x * x + y * y + 1.0)
+            dx, dy, dz = dx * size, dy * size, dz * size
+            skip = max(0.0, -(ex * dx + ey * dy + ez * dz) - 2.0)
+            origin[k, 0], origin[k, 1], origin[k, 2] = ex + skip * dx, ey + skip * dy, ez + skip * dz
+            direction[k, 0], direction[k, 1], direction[k, 2] = dx, dy, dz
+            _begin(rays, k, i, each, stream, numbers[i] * each + j)
+            k += 1

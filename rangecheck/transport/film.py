@@ -120,11 +120,15 @@ def expose(pixels, each, sample, face, mean, spread, covered, count):
     """Add one observation of each pixel, the mean of `each` rays; `face` says whether a ray met a surface."""
     for i in range(len(pixels)):
         pixel = pixels[i]
-        count[pixel] += 1
         met = np.int64(0)
         for j in range(each):
             met += face[i * each + j] >= 0
         covered[pixel] += np.float32(met / each)
+        count[pixel] += 1
+        if count[pixel] == 1:
+            for c in range(sample.shape[1]):
+                mean[pixel, c], spread[pixel, c] = sample[i, c], 0.0
+            continue
         for c in range(sample.shape[1]):
             before = sample[i, c] - mean[pixel, c]
             mean[pixel, c] += before / count[pixel]

@@ -21,7 +21,7 @@ from rangecheck.transport.reflection import spike_of
 from rangecheck.transport.scatter import mirror_ray
 
 #: a pixel whose middle mirrors further than this from a source's rim is taken not to see it: radians
-REACH = 0.5
+REACH = 0.25
 #: cells along a side of a pixel whose footprint meets a source
 CELLS = 4
 #: corners whose mirror directions lie further apart than this (tangent) do not belong to one smooth footprint
@@ -128,7 +128,7 @@ def circle_in_wedge(px, py, qx, qy, radius):
 
 @stage_kernel
 def _seen_share(corners, radius):
-    """(share of the quadrilateral corners (4, 2) that the circle fills, whether any of it is inside); -1 where it is torn."""
+    """Share of the quadrilateral corners (4, 2) that the circle fills; -1 where it is torn."""
     total = shared = 0.0
     for k in range(4):
         m = (k + 1) % 4
@@ -143,47 +143,78 @@ def _seen_share(corners, radius):
 
 
 @stage_kernel
+def _seen_from(sources, s, hits, hit):
+    """(direction, distance) of source s from a hit, and the radius that it has in the plane through its middle."""
+    x = sources.centre[s, 0] - hits.place[hit, 0]
+    y = sources.centre[s, 1] - hits.place[hit, 1]
+    z = sources.centre[s, 2] - hits.place[hit, 2]
+    distance = math.sqrt(x * x + y * y + z * z)
+    sine = min(0.999, sources.radius[s] / distance)
+    return x / distance, y / distance, z / distance, distance, sine / math.sqrt(1.0 - sine * sine)
+
+
+@stage_kernel
+def _footprint(sources, s, x, y, z, distance, places, directions, first, row, quad):
+    """Where the mirror rays of one cell's corners (first, first + 1, first + row + 1, first + row) meet the plane through the source;
+    False where one of them does not."""
+    ax, ay, az, bx, by, bz = frame_around(x, y, z)
+    for k in range(4):
+        j = first + (row if k >= 2 else 0) + (1 if k == 1 or k == 2 else 0)
+        dx, dy, dz = directions[j, 0], directions[j, 1], directions[j, 2]
+        ahead = dx * x + dy * y + dz * z
+        if not ahead > 0.1:
+            return False
+        px = (places[j, 0] - sources.centre[s, 0]) / distance
+        py = (places[j, 1] - sources.centre[s, 1]) / distance
+        pz = (places[j, 2] - sources.centre[s, 2]) / distance
+        far = -(px * x + py * y + pz * z) / ahead
+        px, py, pz = px + far * dx, py + far * dy, pz + far * dz
+        quad[k, 0] = px * ax + py * ay + pz * az
+        quad[k, 1] = px * bx + py * by + pz * bz
+    return True
+
+
+@stage_kernel
+def keep_near(sources, hits, glint_hit, glint_source, n, places, directions, quad):
+    """Keep, in place and in order, the pairs whose whole pixel's footprint lies no further from the source than its own size, and
+    those that have none; returns how many."""
+    k = np.int64(0)
+    for i in range(n):
+        hit, s = glint_hit[i], glint_source[i]
+        x, y, z, distance, radius = _seen_from(sources, s, hits, hit)
+        near = True
+        if _footprint(sources, s, x, y, z, distance, places, directions, 4 * i, 2, quad):
+            size = aside = 0.0
+            for c in range(4):
+                size = max(size, math.hypot(quad[c, 0] - quad[(c + 2) % 4, 0], quad[c, 1] - quad[(c + 2) % 4, 1]))
+                size = max(size, math.hypot(quad[c, 0] - quad[(c + 1) % 4, 0], quad[c, 1] - quad[(c + 1) % 4, 1]))
+            aside = math.hypot(quad[0, 0] + quad[2, 0], quad[0, 1] + quad[2, 1]) / 2
+            near = aside < radius + 2.0 * size
+        if near:
+            glint_hit[k], glint_source[k] = hit, s
+            k += 1
+    return k
+
+
+@stage_kernel
 def glint_shares(sources, hits, glint_hit, glint_source, n, cells, places, directions, whole, quad, share):
     """share (n,) of each pixel in which the source is mirrored; `whole`: all of it as soon as any, as the report has it.
 
     places, directions (n (cells + 1)^2, 3); quad (4, 2) is scratch. A cell without a smooth footprint (its corners meet different things) is
     judged by the hit's own mirror ray."""
-    each = (cells + 1) * (cells + 1)
+    row = cells + 1
     for i in range(n):
         hit, s = glint_hit[i], glint_source[i]
-        x, y, z = (
-            sources.centre[s, 0] - hits.place[hit, 0],
-            sources.centre[s, 1] - hits.place[hit, 1],
-            sources.centre[s, 2] - hits.place[hit, 2],
-        )
-        distance = math.sqrt(x * x + y * y + z * z)
-        x, y, z = x / distance, y / distance, z / distance
-        sine = min(0.999, sources.radius[s] / distance)
-        radius = sine / math.sqrt(1.0 - sine * sine)
-        ax, ay, az, bx, by, bz = frame_around(x, y, z)
+        x, y, z, distance, radius = _seen_from(sources, s, hits, hit)
         mx, my, mz = mirror_ray(hits, hit)
         middle = mx * x + my * y + mz * z
-        inside = 1.0 if middle > 0.0 and middle * middle >= 1.0 - sine * sine else 0.0
+        inside = 1.0 if middle > 0.0 and middle * middle * (1.0 + radius * radius) >= 1.0 else 0.0
         total = 0.0
         for r in range(cells):
             for c in range(cells):
-                whole_quad = True
-                for k in range(4):
-                    row = r + (1 if k >= 2 else 0)
-                    column = c + (1 if k == 1 or k == 2 else 0)
-                    j = i * each + row * (cells + 1) + column
-                    dx, dy, dz = directions[j, 0], directions[j, 1], directions[j, 2]
-                    ahead = dx * x + dy * y + dz * z
-                    if not ahead > 0.1:
-                        whole_quad = False
-                    px = (places[j, 0] - sources.centre[s, 0]) / distance
-                    py = (places[j, 1] - sources.centre[s, 1]) / distance
-                    pz = (places[j, 2] - sources.centre[s, 2]) / distance
-                    far = -(px * x + py * y + pz * z) / ahead
-                    px, py, pz = px + far * dx, py + far * dy, pz + far * dz
-                    quad[k, 0] = px * ax + py * ay + pz * az
-                    quad[k, 1] = px * bx + py * by + pz * bz
-                seen = _seen_share(quad, radius) if whole_quad else -1.0
+                first = i * row * row + r * row + c
+                smooth = _footprint(sources, s, x, y, z, distance, places, directions, first, row, quad)
+                seen = _seen_share(quad, radius) if smooth else -1.0
                 total += inside if seen < 0.0 else seen
         share[i] = total / (cells * cells)
         if whole:

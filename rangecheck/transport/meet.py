@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from rangecheck.kernels import inline_kernel, stage_kernel
-from rangecheck.scene.surroundings import add_surroundings
+from rangecheck.scene.surroundings import CONSTANT, add_surroundings
 from rangecheck.transport.geometry import place_hit
 from rangecheck.transport.queues import CAMERA, SPIKE
 
@@ -47,6 +47,9 @@ def meet(geometry, sources, surroundings, rays, n, reflections, backdrop, gather
     origin, direction, far, faces, us, vs, weight, pixels, kinds, firsts, streams, numbers = rays
     place, shading, facing, arriving, hit_weight, hit_pixel, hit_first, hit_material, hit_stream, hit_number = hits
     count = np.int64(0)
+    dark = True
+    for c in range(sample.shape[1]):
+        dark = dark and sky == CONSTANT and low[c] == 0.0 and len(boxes) == 0
     channels = sample.shape[1]
     for i in range(n):
         face, kind, pixel = faces[i], kinds[i], pixels[i]
@@ -62,7 +65,7 @@ def meet(geometry, sources, surroundings, rays, n, reflections, backdrop, gather
                     tally[firsts[i], reflections, seen] += light
                 continue
         if face < 0:
-            if kind != CAMERA or backdrop:
+            if not dark and (kind != CAMERA or backdrop):
                 tally[firsts[i], reflections, len(radius)] += add_surroundings(
                     sky, frame, period, softness, low, high, picture, boxes, glow, dx, dy, dz, weight, i, sample, pixel
                 )

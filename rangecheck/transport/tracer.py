@@ -22,10 +22,10 @@ from rangecheck.kernels import in_chunks
 from rangecheck.optics import Camera
 from rangecheck.raycast import EmbreeCaster
 from rangecheck.scene import Scene
-from rangecheck.transport.camera_rays import PictureRays, pixel_order, start_rays
+from rangecheck.transport.camera_rays import PictureRays, pixel_order
 from rangecheck.transport.film import Film, Plate, expose
 from rangecheck.transport.geometry import geometry_of, sources_of
-from rangecheck.transport.glint import CELLS, aim_glints, corner_places, find_glints, glint_shares, mirrored_corners
+from rangecheck.transport.glint import CELLS, aim_glints, corner_places, find_glints, glint_shares, keep_near, mirrored_corners
 from rangecheck.transport.light import add_light, aim
 from rangecheck.transport.meet import meet
 from rangecheck.transport.queues import KIND_NAMES, LOBE, SPIKE, Hits, Rays, Shadows, Workspace
@@ -33,8 +33,8 @@ from rangecheck.transport.reflection import materials_of
 from rangecheck.transport.scatter import choose_one, split
 from rangecheck.transport.settings import Settings
 
-#: pixels that go through the stages together: one tile
-CHUNK = 4096
+#: pixels that go through the stages together: two tiles
+CHUNK = 8192
 #: most rays that wait in one queue
 _QUEUE = 32768
 
@@ -92,6 +92,8 @@ class Tracer:
         """Add observations number first .. first + count - 1 of each of the pixels, none named twice, to the plate.
 
         Returns the tally (first reflection, reflections, light) of their light."""
+        if isinstance(first, int) and isinstance(count, int) and count == 1:
+            return self._expose_once(picture, pixels, settings, seed, plate, first)
         counts = np.broadcast_to(np.asarray(count, np.int64), len(pixels))
         firsts = np.broadcast_to(np.asarray(first, np.int64), len(pixels))
         ends = np.cumsum(counts)
@@ -111,6 +113,20 @@ class Tracer:
             return tally
 
         return np.sum(in_chunks(chunk, len(pieces), 1), axis=0)
+
+    def _expose_once(
+        self, picture: PictureRays, pixels: IntArray, settings: Settings, seed: int, plate: Plate, number: int
+    ) -> FloatArray:
+        numbers = np.full(min(len(pixels), CHUNK), number, np.int64)
+
+        def chunk(start: int, stop: int) -> FloatArray:
+            mine = pixels[start:stop]
+            with self._workspace() as work:
+                sample, face, tally = _Chunk(self, settings, work).shine(picture, mine, numbers[: stop - start], seed)
+                expose(mine, settings.each, sample, face, plate.mean, plate.spread, plate.covered, plate.count)
+            return tally
+
+        return np.sum(in_chunks(chunk, len(pixels), max(1, CHUNK // settings.each)), axis=0)
 
     def probe(self, picture: PictureRays, pixels: IntArray, settings: Settings, seed: int) -> FloatArray:
         """(passes, n, c) float32: `settings.passes` observations of each of a few pixels."""
@@ -153,8 +169,7 @@ class _Chunk:
         rays, places = self._work.rays(0, n), self._work.pixel_places(n)
         self._sample = self._work.samples(len(pixels))
         self._picture, self._pixels = picture, pixels
-        start_rays(pixels, numbers, picture.camera.width, each, centre, seed & 0xFFFFFFFF, places, rays)
-        picture.fill(places[0], places[1], rays.origin, rays.direction)
+        picture.start(pixels, numbers, each, centre, seed, places, rays)
         self._follow(rays, n, 0)
         return self._sample, rays.face[:n], self._tally
 
@@ -212,26 +227,34 @@ class _Chunk:
         glint_hit = np.empty(count * len(tracer.sources.radius), np.int32)
         glint_source = np.empty_like(glint_hit)
         n = find_glints(tracer.materials, tracer.sources, hits, count, glint_hit, glint_source)
+        quad = np.empty((4, 2))
+        if not whole and n:
+            places, directions = self._mirrored(hits, glint_hit[:n], 1)
+            n = keep_near(tracer.sources, hits, glint_hit, glint_source, n, places, directions, quad)
         cells = 1 if whole else CELLS
-        each = (cells + 1) ** 2
-        step = max(1, _QUEUE // each)
+        step = _QUEUE // (cells + 1) ** 2
         for start in range(0, n, step):
             hit, source = glint_hit[start : min(start + step, n)], glint_source[start : min(start + step, n)]
-            corners = len(hit) * each
-            rays, places = work.rays(1, corners), work.pixel_places(corners)
-            corner_places(self._pixels[hits.pixel[hit]], len(hit), self._picture.camera.width, cells, places)
-            self._picture.fill(places[0], places[1], rays.origin, rays.direction)
-            rays.far[:corners] = np.inf
-            self._cast(rays, corners, coherent=True)
-            corner, directions, share = np.empty((corners, 3)), np.empty((corners, 3)), np.empty(len(hit))
-            mirrored_corners(tracer.geometry, rays, corners, work.hits(1, 1), corner, directions)
-            quad = np.empty((4, 2))
-            glint_shares(tracer.sources, hits, hit, source, len(hit), cells, corner, directions, whole, quad, share)
+            places, directions = self._mirrored(hits, hit, cells)
+            share = np.empty(len(hit))
+            glint_shares(tracer.sources, hits, hit, source, len(hit), cells, places, directions, whole, quad, share)
             shadows = work.shadows(len(hit))
             k = aim_glints(tracer.sources, tracer.materials, hits, hit, source, share, len(hit), shadows)
             if k:
                 self._block(shadows, k, coherent=False)
                 add_light(shadows, k, 1, self._sample, self._tally, SPIKE)
+
+    def _mirrored(self, hits: Hits, chosen: IntArray, cells: int) -> tuple[FloatArray, FloatArray]:
+        """Places and mirror directions (len(chosen) (cells + 1)^2, 3) of the corners of the cells of these hits' pixels."""
+        work, n = self._work, len(chosen) * (cells + 1) ** 2
+        rays, coordinates = work.rays(1, n), work.pixel_places(n)
+        corner_places(self._pixels[hits.pixel[chosen]], len(chosen), self._picture.camera.width, cells, coordinates)
+        self._picture.fill(coordinates[0], coordinates[1], rays.origin, rays.direction)
+        rays.far[:n] = np.inf
+        self._cast(rays, n, coherent=True)
+        places, directions = np.empty((n, 3)), np.empty((n, 3))
+        mirrored_corners(self._tracer.geometry, rays, n, work.hits(1, 1), places, directions)
+        return places, directions
 
     def _branches(self, reflections: int) -> int:
         settings = self._settings
