@@ -51,20 +51,21 @@ def solid_of(
     """A solid of the surface - a relief closed, a bust cut flat - and the verdict; no solid when it cannot honestly be made one."""
     wanted = settings.solid
     try:
+        made: Solid | Surface
         with reporter.stage("closing"):
             if is_closed(surface):
-                made = Solid.from_surface(_untangled(surface, wanted.max_move_mm, reporter))
+                made = _untangled(surface, wanted.max_move_mm, reporter)
             else:
                 made = close_relief(surface, back_mm=wanted.relief_depth_mm, eye_mm=eye_mm)
                 reporter.note("open surface closed as a relief: skirt and back plane along its outer loop")
         with reporter.stage("base"):
-            made = _based(made, settings, reporter)
+            based = _based(made, settings, reporter)
             if wanted.height_mm is not None:
-                made = _scaled(made, wanted.height_mm)
+                based = _scaled(based, wanted.height_mm)
     except NotSolid as refusal:
         found = refusal.measured.get("verdict")
         return None, found if isinstance(found, Verdict) else check_solid(surface)
-    return made, made.verdict
+    return based, based.verdict
 
 
 def _untangled(surface: Surface, max_move_mm: float, reporter: Reporter) -> Surface:
@@ -78,16 +79,20 @@ def _untangled(surface: Surface, max_move_mm: float, reporter: Reporter) -> Surf
     return result.surface
 
 
-def _based(made: Solid, settings: Settings, reporter: Reporter) -> Solid:
+def _based(made: Solid | Surface, settings: Settings, reporter: Reporter) -> Solid:
+    """Cut flat where it stands, and proved."""
     wanted = settings.solid
+    surface = made.surface if isinstance(made, Solid) else made
     if wanted.base_height_mm is not None:
-        lowest = float(made.surface.bounds_mm[0, 1])
-        return cut_flat(made, height_mm=lowest + wanted.base_height_mm)
-    if wanted.base == "none" or "back" in made.surface.part_names:
-        return made
+        return cut_flat(made, height_mm=float(surface.bounds_mm[0, 1]) + wanted.base_height_mm)
+    if wanted.base == "none" or "back" in surface.part_names:
+        return made if isinstance(made, Solid) else Solid.from_surface(made)
     chosen = choose_base_height(made)
-    reporter.note(f"base at {chosen.height_mm:.1f} mm: {chosen.reason}; {chosen.removed_share:.1%} of the volume goes")
-    return cut_flat(made, height_mm=chosen.height_mm)
+    cut = cut_flat(made, height_mm=chosen.height_mm)
+    reporter.note(
+        f"base at {chosen.height_mm:.1f} mm: {chosen.reason}; {1 - cut.volume_mm3 / made.volume_mm3:.1%} of the volume goes"
+    )
+    return cut
 
 
 def _scaled(made: Solid, height_mm: float) -> Solid:

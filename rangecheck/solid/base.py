@@ -14,24 +14,26 @@ from rangecheck.arrays import FloatArray, require
 from rangecheck.errors import SurfaceError
 from rangecheck.solid.engine import from_engine, to_engine
 from rangecheck.solid.solid import Solid
-from rangecheck.surface.surface import INVENTED
+from rangecheck.surface.surface import INVENTED, Surface
 
 UP = (0.0, 1.0, 0.0)
 
 
 @dataclass(frozen=True)
 class BaseHeight:
-    """Where to cut: `height_mm` along `up`, why there in one sentence, and the share of volume that goes."""
+    """Where to cut: `height_mm` along `up`, and why there in one sentence."""
 
     height_mm: float
     reason: str
-    removed_share: float
 
 
-def cut_flat(solid: Solid, *, height_mm: float, up: npt.ArrayLike = UP) -> Solid:
-    """What of `solid` lies above the plane up . x = height_mm, capped there. Raises SurfaceError when nothing or all would remain."""
+def cut_flat(solid: Solid | Surface, *, height_mm: float, up: npt.ArrayLike = UP) -> Solid:
+    """What of `solid` lies above the plane up . x = height_mm, capped there. A closed Surface will do: what is left of it is proved.
+
+    Raises SurfaceError when nothing or all would remain, NotSolid when what remains is no solid."""
     normal = _unit(up)
-    heights = solid.surface.vertices @ normal
+    whole, notes = (solid.surface, solid.notes) if isinstance(solid, Solid) else (solid, ())
+    heights = whole.vertices @ normal
     low, high = float(heights.min()), float(heights.max())
     if not low < height_mm < high:
         raise SurfaceError(
@@ -40,22 +42,22 @@ def cut_flat(solid: Solid, *, height_mm: float, up: npt.ArrayLike = UP) -> Solid
             low_mm=low,
             high_mm=high,
         )
-    engine, number = to_engine(solid.surface)
+    engine, number = to_engine(whole)
     kept = engine.trim_by_plane(tuple(normal), float(height_mm))
-    surface = from_engine(kept, [(number, solid.surface)], "base")
-    removed = 1 - surface.volume_mm3 / solid.volume_mm3
+    surface = from_engine(kept, [(number, whole)], "base")
+    removed = 1 - surface.volume_mm3 / whole.volume_mm3
     note = f"cut flat at {height_mm:.3f} mm: {removed:.2%} of the volume went"
-    return Solid.from_surface(surface, notes=(*solid.notes, note))
+    return Solid.from_surface(surface, notes=(*notes, note))
 
 
-def choose_base_height(solid: Solid, *, up: npt.ArrayLike = UP, most_removed: float = 0.35) -> BaseHeight:
+def choose_base_height(solid: Solid | Surface, *, up: npt.ArrayLike = UP, most_removed: float = 0.35) -> BaseHeight:
     """The lowest plane above which the surface is measured: below it lies what was invented to close the bottom.
 
     Walking upwards in 200 levels, the cut is where the invented share of the area, over the next 2 % of the height, first falls
     below 5 %, or if it never does, below half; at most `most_removed` of the height is given up. A solid without invented faces near its bottom is cut 1 % above it,
     which only makes it stand flat."""
     normal = _unit(up)
-    surface = solid.surface
+    surface = solid.surface if isinstance(solid, Solid) else solid
     heights = surface.vertices @ normal
     low, high = float(heights.min()), float(heights.max())
     tall = high - low
@@ -79,13 +81,7 @@ def choose_base_height(solid: Solid, *, up: npt.ArrayLike = UP, most_removed: fl
         step = limit
         reason = f"invented surface reaches above {most_removed:.0%} of the height; no more is given up"
     height = low + max(step, 1) / 200 * tall
-    below = _share_below(solid, normal, height)
-    return BaseHeight(float(height), reason, below)
-
-
-def _share_below(solid: Solid, normal: FloatArray, height_mm: float) -> float:
-    engine, _ = to_engine(solid.surface)
-    return 1.0 - float(engine.trim_by_plane(tuple(normal), float(height_mm)).volume()) / solid.volume_mm3
+    return BaseHeight(float(height), reason)
 
 
 def _moving_sum(values: FloatArray, width: int) -> FloatArray:
