@@ -218,3 +218,63 @@ def test_the_reports_own_approximations_can_be_had():
     assert best.standard_error() <= 0.05 * best.mean_radiance
     with pytest.raises(SettingError, match="plan, full, report"):
         make_plan(tracer, camera, pose, model="fast")
+
+
+def figure_scene(name):
+    """Figure 8's ball, or figure 11's ball on a plane, of an intermediately rough perfect conductor."""
+    rough = Material("rough", K_s=1.0, sigma_um=0.1, correlation_um=3.0, wavelengths_um=(0.555,))
+    surface = ball(5)
+    if name == "figure 8":
+        room = Scene(
+            surface, (rough,), sources=(lamp((250, 300, 260), 4.0, 60.0),), smooth=True, vertex_normals=surface.vertices / 50.0
+        )
+        return room, looking(128, 128, fov=24.0)
+    both = join([floor(300.0, -50.0), surface])
+    lamps = (lamp((150, 200, 300), 12.0, 30.0),)
+    room = Scene(both, (rough,), sources=lamps, surroundings=gradient(0.05, 0.4), smooth_of_part=(False, True))
+    return room, looking(48, 48, fov=34.0, eye=(0, 130, 300), at=(0, -15, 0))
+
+
+def test_figure_8_shows_a_broad_lobe_and_a_small_bright_spot_at_once():
+    room, (camera, pose) = figure_scene("figure 8")
+    both = Tracer(room).render(camera, pose, Settings(centre=True, depth=1, shadow_rays=4)).radiance[..., 0]
+    lobe = Tracer(room).render(camera, pose, Settings(centre=True, depth=1, shadow_rays=4, spike=False)).radiance[..., 0]
+    row, column = np.unravel_index(np.argmax(both), both.shape)
+    # the spot stands above the lobe under it, and is a few pixels wide, while the lobe's half width is ten times that
+    assert both[row, column] > 1.5 * lobe[row, column]
+    spot = (both - lobe) > 0.5 * (both - lobe).max()
+    wide = lobe > 0.5 * lobe.max()
+    assert spot.sum() <= 4 and wide.sum() > 20 * spot.sum()
+
+
+def test_figure_11_shows_the_plane_in_the_ball():
+    room, (camera, pose) = figure_scene("figure 11")
+    alone = Scene(ball(5), room.materials, sources=room.sources, surroundings=room.surroundings, smooth=True)
+    settings = Settings(passes=8, each=4, depth=4)
+    together, single = Tracer(room).render(camera, pose, settings), Tracer(alone).render(camera, pose, settings)
+    below = (single.coverage == 1) & (together.coverage == 1)
+    below[: below.shape[0] // 2] = False
+    changed = np.abs(together.radiance - single.radiance)[below].mean()
+    assert changed > 10 * np.sqrt((together.variance + single.variance)[below].mean() / below.sum())
+    assert float(together.shares()["reflections"]["2"]) > 0.05
+
+
+def test_time_to_an_error_is_read_between_measured_points_and_beyond_them():
+    from rangecheck.transport.benchmark import TimedError, time_to_error
+
+    points = [TimedError("a", str(k), 1.0 * 4**k, 0.08 / 2**k) for k in range(3)]
+    assert time_to_error(points, "a", 0.04) == pytest.approx(4.0)
+    assert time_to_error(points, "a", 0.04 / math.sqrt(2)) == pytest.approx(8.0)
+    assert time_to_error(points, "a", 0.01) == pytest.approx(64.0)
+    assert time_to_error(points, "a", 0.1) == 1.0
+    assert math.isnan(time_to_error(points, "b", 0.1))
+
+
+def test_the_bare_cast_of_a_picture_casts_the_rays_of_that_picture():
+    from rangecheck.transport.benchmark import cast_ratio
+    from rangecheck.transport.settings import DIRECT
+
+    tracer = Tracer(scene("table plaster dark"))
+    measured = cast_ratio(tracer, *looking(64, 64, fov=26.0, eye=(0, 60, 290)), DIRECT, repeats=1)
+    # every pixel, and two shadow rays at most from each
+    assert 64 * 64 < measured.rays <= 3 * 64 * 64 and measured.ratio > 0
