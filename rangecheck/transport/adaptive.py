@@ -43,7 +43,7 @@ def render_to(
     error: float,
     *,
     seed: int = 0,
-    most: int = 4096,
+    most: int = 1 << 18,
 ) -> Film:
     """The picture with an estimated error of at most `error` (0.005: half a percent of the mean radiance), or as near to that as
     `most` rays per pixel bring it. `settings.passes`, `each` and `centre` are chosen here. Same bytes on any number of threads."""

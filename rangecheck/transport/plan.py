@@ -118,7 +118,7 @@ def render_evenly(
     error: float,
     *,
     seed: int = 0,
-    most: int = 4096,
+    most: int = 1 << 18,
 ) -> Film:
     """The same number of samples in every pixel, as many as bring the frame's standard error to `error` of its mean."""
     passes = 4
