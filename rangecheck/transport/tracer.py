@@ -169,8 +169,10 @@ class _Chunk:
         rays, places = self._work.rays(0, n), self._work.pixel_places(n)
         self._sample = self._work.samples(len(pixels))
         self._picture, self._pixels = picture, pixels
-        picture.start(pixels, numbers, each, centre, seed, places, rays)
-        self._follow(rays, n, 0)
+        # hashes overflow by design; only where nothing is compiled would numpy warn of it
+        with np.errstate(over="ignore"):
+            picture.start(pixels, numbers, each, centre, seed, places, rays)
+            self._follow(rays, n, 0)
         return self._sample, rays.face[:n], self._tally
 
     def _follow(self, rays: Rays, n: int, reflections: int) -> None:
