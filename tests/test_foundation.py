@@ -4,6 +4,7 @@ import json
 import math
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -116,3 +117,29 @@ def test_every_package_folder_is_listed_for_the_wheel():
     listed = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"])
     found = {".".join(p.parent.relative_to(ROOT).parts) for p in (ROOT / "rangecheck").rglob("__init__.py")}
     assert listed == found | {"rangecheck.presets", "rangecheck_cli"}
+
+
+def test_a_compiled_kernel_is_keyed_by_the_sources_of_what_it_imports():
+    package = Path(kernels.__file__).parent
+    names = {str(Path(path).relative_to(package)) for path in kernels.sources_of(package / "transport" / "scatter.py")}
+    assert {"transport/scatter.py", "transport/geometry.py", "reflectance/fast.py", "reflectance/octaves.py"} <= names
+    assert not names & {"pipeline/job.py", "surface/surface.py"}
+
+
+def test_a_changed_source_changes_the_key_of_kernels_that_import_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(kernels, "_PACKAGE", tmp_path / "rangecheck")
+    folder = tmp_path / "rangecheck"
+    folder.mkdir()
+    (folder / "constants.py").write_text("SIZE = 3\n")
+    (folder / "inner.py").write_text("from rangecheck.kernels import kernel\nfrom rangecheck.constants import SIZE\n")
+    (folder / "outer.py").write_text("from rangecheck.kernels import kernel\nfrom .inner import (\n    f,\n)\n")
+
+    def key():
+        kernels.sources_of.cache_clear()
+        return kernels.GivenFolder.get_source_stamp(SimpleNamespace(_py_file=str(folder / "outer.py")))
+
+    before = key()
+    assert key() == before
+    (folder / "constants.py").write_text("SIZE = 4\n")
+    assert key() != before
+    kernels.sources_of.cache_clear()
