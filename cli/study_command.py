@@ -2,15 +2,19 @@
 
 import click
 
+from rangecheck.studies import STUDIES
+
 from .common import common
 
 
 @click.command("study", short_help="Chart speed against accuracy, and find where methods break.")
-@click.argument("what", type=click.Choice(["reflectance"]))
+@click.argument("what", metavar="NAME")
+@click.option("--part", metavar="PART", help="Only this part of the study.")
 @click.option("--quick", is_flag=True, help="Fewer points and repeats: a first look.")
 @common("out_dir", "force")
-def command(what, quick, out, force, reporter):
-    """Chart speed against accuracy, and find where methods break, on this machine."""
+def command(what, part, quick, out, force, reporter):
+    """Chart speed against accuracy, and find where methods break, on this machine. A NAME or PART that does not exist is answered with
+    those that do."""
     from rangecheck.pipeline import study
 
-    return study(what, out, quick=quick, force=force, reporter=reporter)
+    return study(what, out, quick=quick, part=part, force=force, reporter=reporter)

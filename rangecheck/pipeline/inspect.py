@@ -153,15 +153,15 @@ def materials(names: Sequence[str], out: str | None, *, force: bool, reporter: R
     return Outcome(document("materials", materials=found), lines)
 
 
-def study(name: str, out: str, *, quick: bool, force: bool, reporter: Reporter) -> Outcome:
+def study(name: str, out: str, *, quick: bool, force: bool, reporter: Reporter, parts: Sequence[str] = ()) -> Outcome:
     """A study of speed against accuracy and of stability, made again on this machine; charts and numbers in `out`."""
     from rangecheck.pipeline.folder import check_writable
     from rangecheck.studies import study_named
     from rangecheck.study import write_study
 
-    make = study_named(name)
+    make = study_named(name, part)
     check_writable(out)
     with reporter.stage(f"study of {name}"):
-        made = make(quick=quick)
+        made = make(quick=quick, parts=parts)
     written = write_study(made, out, force=force)
     return Outcome(made.document(), [f"{made.title}", *made.findings, *(str(path) for path in written)])

@@ -4,16 +4,29 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from rangecheck.errors import SettingError
-from rangecheck.study import Study
 
-#: every study by name, and the module whose `study(quick)` makes it
-STUDIES = {"reflectance": "rangecheck.studies.reflectance"}
+if TYPE_CHECKING:
+    from rangecheck.study import Study
+
+#: every study by name, and the module whose `study(quick, parts)` makes it
+STUDIES = {
+    "reflectance": "rangecheck.studies.reflectance",
+}
 
 
-def study_named(name: str) -> Callable[..., Study]:
-    """The function `study(quick=False) -> Study` of that name. Raises SettingError naming those that exist."""
+def study_named(name: str, part: str | None = None) -> Callable[..., Study]:
+    """The function `study(quick=False) -> Study` of that name, or of one of its parts. Raises SettingError naming those that exist."""
     if name not in STUDIES:
         raise SettingError(f"there is no study {name!r}; choose one of {', '.join(STUDIES)}", key=name)
-    return importlib.import_module(STUDIES[name]).study
+    module = importlib.import_module(STUDIES[name])
+    if part is None:
+        made: Callable[..., Study] = module.study
+        return made
+    parts = getattr(module, "PARTS", ())
+    if part not in parts:
+        said = f"its parts are {', '.join(parts)}" if parts else "it is made as a whole"
+        raise SettingError(f"the study {name!r} has no part {part!r}; {said}", key=part)
+    return partial(module.study, part=part)
