@@ -12,12 +12,14 @@ from rangecheck.study import (
     Line,
     LineChart,
     Measurement,
+    Part,
     SpeedChart,
     Study,
     describe_machine,
     find_edge,
     measure,
     pareto_front,
+    study_of_parts,
     write_study,
 )
 from rangecheck.study.charts import draw
@@ -181,3 +183,23 @@ def test_the_same_numbers_give_the_same_bytes():
 def test_the_machine_says_processor_and_versions():
     machine = describe_machine()
     assert machine["processor"] and machine["packages"]["numpy"] and machine["python"]
+
+
+def test_a_study_of_parts_runs_those_asked_for_and_says_what_they_took():
+    asked = []
+
+    def part(name):
+        def run(quick):
+            asked.append((name, quick))
+            return Part(findings=[name], tables={name: [{"a": 1}]})
+
+        return run
+
+    study = study_of_parts("sums", "Sums", {name: part(name) for name in ("one", "two", "three")})
+    whole = study(quick=True)
+    assert asked == [("one", True), ("two", True), ("three", True)] and whole.findings == ["one", "two", "three"]
+    some = study(part="three")
+    assert some.name == "sums-three" and set(some.tables) == {"parts", "three"}
+    assert all(row["seconds"] >= 0 and row["peak_memory_mb"] > 1 for row in some.tables["parts"])
+    with pytest.raises(SettingError, match="no part 'four'; its parts are one, two, three"):
+        study(part="four")

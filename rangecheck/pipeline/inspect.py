@@ -153,7 +153,7 @@ def materials(names: Sequence[str], out: str | None, *, force: bool, reporter: R
     return Outcome(document("materials", materials=found), lines)
 
 
-def study(name: str, out: str, *, quick: bool, force: bool, reporter: Reporter, parts: Sequence[str] = ()) -> Outcome:
+def study(name: str, out: str, *, quick: bool, force: bool, reporter: Reporter, part: str | None = None) -> Outcome:
     """A study of speed against accuracy and of stability, made again on this machine; charts and numbers in `out`."""
     from rangecheck.pipeline.folder import check_writable
     from rangecheck.studies import study_named
@@ -162,6 +162,6 @@ def study(name: str, out: str, *, quick: bool, force: bool, reporter: Reporter, 
     make = study_named(name, part)
     check_writable(out)
     with reporter.stage(f"study of {name}"):
-        made = make(quick=quick, parts=parts)
+        made = make(quick=quick)
     written = write_study(made, out, force=force)
     return Outcome(made.document(), [f"{made.title}", *made.findings, *(str(path) for path in written)])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING
 
 from rangecheck.errors import SettingError
@@ -11,7 +12,7 @@ from rangecheck.errors import SettingError
 if TYPE_CHECKING:
     from rangecheck.study import Study
 
-#: every study by name, and the module whose `study(quick, parts)` makes it
+#: every study by name, and the module whose `study(quick, part)` makes it
 STUDIES = {
     "reflectance": "rangecheck.studies.reflectance",
 }

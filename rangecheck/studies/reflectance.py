@@ -20,7 +20,7 @@ from rangecheck.reflectance.energy import lobe_albedo, visibility_of, visibility
 from rangecheck.reflectance.fast import FAST_ERROR, lobe_fast, lobe_table
 from rangecheck.reflectance.lobe import MASKINGS, SMITH, two_numbers
 from rangecheck.reflectance.series import lobe_rough, lobe_series, lobe_smooth
-from rangecheck.study import Candidate, Edge, EdgeChart, Line, LineChart, SpeedChart, Study, find_edge, measure
+from rangecheck.study import Candidate, Edge, EdgeChart, Line, LineChart, Part, SpeedChart, find_edge, measure, study_of_parts
 
 GREEN_UM = 0.555
 #: smooth, intermediate, rough: the roughness that light sees
@@ -29,29 +29,6 @@ REGIMES = {"smooth": (1e-6, 1e-2), "intermediate": (0.1, 10.0), "rough": (1e2, 1
 _WITHIN = 4.0
 #: surfaces of physics that span mirror to ground metal, sigma and T
 SURFACES = ((0.02, 3.0), (0.1, 3.0), (0.2, 3.0), (1.0, 10.0), (2.0, 6.0))
-
-
-def study(quick: bool = False) -> Study:
-    """The whole study; `quick` takes fewer points and rounds, for a first look (10 s instead of a minute on two idle cores, of which most is quadrature)."""
-    speed, forms_table = _forms(points=60 if quick else 200, evaluations=5_000 if quick else 50_000, rounds=5 if quick else 15)
-    limits = _limits(25 if quick else 81)
-    grazing, grazing_rows = _grazing(24 if quick else 60)
-    by_roughness, edge_rows = _grazing_by_roughness(4 if quick else 13)
-    changes, change_rows = _changes(30 if quick else 90)
-    findings = [edge.in_words for chart in limits for edge in chart.edges]
-    findings += [f"published model, {row['in_words']}" for row in grazing_rows]
-    return Study(
-        "reflectance",
-        "Forms of the specular lobe: speed, accuracy, and where each breaks",
-        [*speed, *limits, grazing, by_roughness, *changes],
-        findings,
-        {
-            "forms": forms_table,
-            "grazing_edges": grazing_rows,
-            "grazing_by_roughness": edge_rows,
-            "masking_and_bound": change_rows,
-        },
-    )
 
 
 def forty_digits(g: float, a: float) -> Decimal:
@@ -317,3 +294,35 @@ def _changes(steps: int) -> tuple[list[LineChart], list[dict[str, Any]]]:
         )
     )
     return charts, rows
+
+
+def _forms_part(quick: bool) -> Part:
+    charts, rows = _forms(points=60 if quick else 200, evaluations=5_000 if quick else 50_000, rounds=5 if quick else 15)
+    said = [
+        f"{row['regime']} surface, {row['method']}{', ' + row['setting'] if row['setting'] else ''}: "
+        f"{row['ns']:.3g} ns per evaluation per core, error {row['error']:.2g}"
+        for row in rows
+    ]
+    return Part(charts, said, {"forms": rows})
+
+
+def _limits_part(quick: bool) -> Part:
+    charts = _limits(25 if quick else 81)
+    return Part(charts, [edge.in_words for chart in charts for edge in chart.edges])
+
+
+def _grazing_part(quick: bool) -> Part:
+    grazing, rows = _grazing(24 if quick else 60)
+    by_roughness, edges = _grazing_by_roughness(4 if quick else 13)
+    said = [f"published model, {row['in_words']}" for row in rows]
+    return Part([grazing, by_roughness], said, {"grazing_edges": rows, "grazing_by_roughness": edges})
+
+
+def _changes_part(quick: bool) -> Part:
+    charts, rows = _changes(30 if quick else 90)
+    return Part(charts, (), {"masking_and_bound": rows})
+
+
+_PARTS = {"forms": _forms_part, "limits": _limits_part, "grazing": _grazing_part, "bound": _changes_part}
+PARTS = tuple(_PARTS)
+study = study_of_parts("reflectance", "Forms of the specular lobe: speed, accuracy, and where each breaks", _PARTS)

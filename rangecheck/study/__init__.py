@@ -1,6 +1,7 @@
 """Speed against accuracy, and stability: takes callables, knows no stage. Definitions of studies live in `rangecheck.studies`."""
 
 from rangecheck.study.machine import describe_machine
+from rangecheck.study.parts import Part, peak_memory_mb, study_of_parts
 from rangecheck.study.result import EdgeChart, Line, LineChart, SpeedChart, Study, write_study
 from rangecheck.study.speed import Candidate, Measurement, measure, pareto_front
 from rangecheck.study.stability import Edge, find_edge
@@ -12,11 +13,14 @@ __all__ = [
     "Line",
     "LineChart",
     "Measurement",
+    "Part",
     "SpeedChart",
     "Study",
     "describe_machine",
     "find_edge",
     "measure",
     "pareto_front",
+    "peak_memory_mb",
+    "study_of_parts",
     "write_study",
 ]
