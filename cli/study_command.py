@@ -2,8 +2,6 @@
 
 import click
 
-from rangecheck.studies import STUDIES
-
 from .common import common
 
 
