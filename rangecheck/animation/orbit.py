@@ -130,7 +130,7 @@ def orbit_around(
         raise SceneError("the surface has no faces; there is nothing to frame")
     if not 0 <= margin < 0.5:
         raise CameraError(f"margin is {margin}; it must be at least 0 and below 0.5", name="margin")
-    points = surface.vertices[np.unique(surface.faces)]
+    points = _extreme_points(surface.vertices[np.unique(surface.faces)])
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     radius = float(np.linalg.norm(points - middle, axis=1).max()) or 1.0
     unit = Orbit((0.0, 0.0, 0.0), 1.0, elevation_deg, frames, axis, start_deg, swing_deg)
@@ -161,6 +161,18 @@ def orbit_around(
     )
     centre = middle + radius * (roomy.x if roomy.status == 0 else tightest.x)[:3]
     return _orbit_at(unit, centre, distance * radius)
+
+
+def _extreme_points(points: FloatArray) -> FloatArray:
+    """The corners of the points' convex hull: no other point is ever the one furthest out. All points where they are few or flat."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    if len(points) < 64:
+        return points
+    try:
+        return points[ConvexHull(points).vertices]
+    except QhullError:
+        return points
 
 
 def _orbit_at(unit: Orbit, centre_mm: FloatArray, distance_mm: float) -> Orbit:

@@ -90,12 +90,23 @@ def png_bytes(picture: npt.NDArray[Any], text: Mapping[str, str] | None = None) 
 
     if picture.dtype not in (np.uint8, np.uint16) or picture.size == 0:
         raise ArrayError(f"picture is {picture.dtype} of shape {picture.shape}; PNG holds uint8 or uint16", name="picture")
+    if not text and (picture.ndim == 2 or picture.shape[2] == 3):
+        return _plain_png(picture)
     info = PngImagePlugin.PngInfo()
     for key, value in (text or {}).items():
         info.add_text(key, value)
     stream = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(picture)).save(stream, "png", compress_level=PNG_LEVEL, pnginfo=info)
     return stream.getvalue()
+
+
+def _plain_png(picture: npt.NDArray[Any]) -> bytes:
+    """Without metadata; several times as fast, which counts where films are made."""
+    import cv2
+
+    channels = picture if picture.ndim == 2 else picture[..., ::-1]
+    encoded = cv2.imencode(".png", np.ascontiguousarray(channels), [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
+    return encoded.tobytes()
 
 
 def write_png(path: str | Path, picture: npt.NDArray[Any], text: Mapping[str, str] | None = None, *, force: bool = True) -> None:

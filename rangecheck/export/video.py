@@ -26,7 +26,7 @@ _TAGS = ["-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "iec
 FORMATS: dict[str, tuple[str, list[str]]] = {
     ".mp4": (
         "libx264",
-        ["-vf", _TO_709, "-crf", "18", "-preset", "medium", "-x264-params", "threads=1:lookahead-threads=1:sliced-threads=0"]
+        ["-vf", _TO_709, "-crf", "18", "-preset", "veryfast", "-x264-params", "threads=1:lookahead-threads=1:sliced-threads=0"]
         + [*_TAGS, "-movflags", "+faststart"],
     ),
     ".webm": ("libvpx-vp9", ["-vf", _TO_709, "-crf", "30", "-b:v", "0", "-deadline", "good", "-cpu-used", "4", *_TAGS]),
