@@ -12,7 +12,6 @@ import numpy as np
 from rangecheck import report
 from rangecheck.config import Settings
 from rangecheck.export.map_files import write_maps
-from rangecheck.export.mapped import contour_picture
 from rangecheck.export.meshes import write_mesh
 from rangecheck.export.pictures import png_bytes
 from rangecheck.export.stl import write_stl
@@ -22,12 +21,12 @@ from rangecheck.pipeline.folder import check_free, job_folder, key_of
 from rangecheck.pipeline.health import versions
 from rangecheck.pipeline.inspect import scan_facts
 from rangecheck.pipeline.outcome import Outcome, document
+from rangecheck.pipeline.page import contours_of, page_of
 from rangecheck.pipeline.shape import findings_lines, solid_of
 from rangecheck.pipeline.subject import eye_of, hashes, read_all_scans, surface_of
-from rangecheck.pipeline.turning import Rendered, render_turntable
+from rangecheck.pipeline.turning import render_turntable
 from rangecheck.pipeline.views import map_at, orbit_of
 from rangecheck.progress import Reporter
-from rangecheck.scan import RangeScan
 from rangecheck.solid import Finding, Verdict, finding, verdict
 from rangecheck.surface import INVENTED, ORIGIN_NAMES, Surface
 
@@ -57,7 +56,7 @@ def run(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None,
             for name in settings.light.materials
         ]
         with reporter.stage("contours"):
-            contours = {scan.name: png_bytes(_contours(scan, settings)) for scan in read}
+            contours = {scan.name: png_bytes(contours_of(scan, settings)) for scan in read}
             for name, picture in contours.items():
                 write_bytes(folder / "contours" / f"{name}.png", picture)
         distance_maps = _distance_maps(shown, folder, settings, reporter)
@@ -85,7 +84,7 @@ def run(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None,
             peak_memory_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         )  # fmt: skip
         with reporter.stage("report"):
-            page = _page(content, judged, read, contours, distance_maps, turntables)
+            page = page_of(content, judged, read, contours, distance_maps, turntables)
             report.write_report(page, folder / "report.html")
         content["seconds"] = dict(reporter.seconds)
         write_json(folder / FINISHED, content)
@@ -119,12 +118,6 @@ def _with_scan_findings(judged: Verdict, shown: Surface, settings: Settings) -> 
     return verdict(found, facts)
 
 
-def _contours(scan: RangeScan, settings: Settings) -> Any:
-    return contour_picture(
-        scan.depth_mm.astype(np.float64), settings.maps.contour_step_mm, title=f"Depth contours of {scan.name}"
-    )
-
-
 def _distance_maps(shown: Surface, folder: Path, settings: Settings, reporter: Reporter) -> list[tuple[str, bytes]]:
     found = []
     with reporter.stage("distance maps", len(settings.maps.azimuths_deg)):
@@ -135,68 +128,3 @@ def _distance_maps(shown: Surface, folder: Path, settings: Settings, reporter: R
             found.append((where, read_bytes(where_to / "distance.png")))
             reporter.advance(index + 1)
     return found
-
-
-def _page(
-    content: dict[str, Any],
-    judged: Verdict,
-    read: list[RangeScan],
-    contours: dict[str, bytes],
-    distance_maps: list[tuple[str, bytes]],
-    turntables: list[Rendered],
-) -> report.ReportContent:
-    """What the report shows, in the order in which a person decides."""
-    import json
-
-    shares = content["area_shares"]
-    reasons = [
-        judged.sentence(),
-        f"{shares['measured']:.0%} of the surface is measured, {shares['interpolated']:.0%} interpolated, {shares['invented']:.0%} invented",
-        f"meshed by {content['method']}: {content['reason']}",
-    ]
-    pictures = [
-        report.Figure(name, "iso-lines of depth over the scan's own relief", picture) for name, picture in contours.items()
-    ]
-    pictures += [
-        report.Figure(scan.name, "brightness, as the scanner's camera saw it", png_bytes(_brightness(scan)))
-        for scan in read
-        if scan.brightness is not None
-    ]
-    scan_section = report.Section(
-        "Scans",
-        "What came in: cells without a return stay without one, they are never points.",
-        [(fact["name"], f"{fact['valid']:,} distances, {fact['valid_share']:.0%} of the grid") for fact in content["scans"]],
-        pictures,
-    )
-    map_section = report.Section(
-        "Distance maps",
-        "Length from a focal point to the surface, from places where no scan was taken.",
-        figures=[report.Figure("Distance", where, picture) for where, picture in distance_maps],
-    )
-    findings = [
-        report.Finding(
-            f.code, f.severity, f.count, f.message,
-            "; ".join("(" + ", ".join(f"{x:.1f}" for x in p) + ")" for p in f.places_mm[:2]) + (" mm" if len(f.places_mm) else ""),
-            f.why, f.mend,
-        )
-        for f in judged.findings
-    ]  # fmt: skip
-    provenance = [(name, text) for name, text in content["versions"].items()]
-    provenance += [(f"input {name}", digest[:16]) for name, digest in content["inputs"].items()]
-    provenance += [(f"time for {stage}", f"{seconds:.1f} s") for stage, seconds in content["seconds"].items()]
-    return report.ReportContent(
-        title="rangecheck report",
-        fit=judged.fit,
-        verdict="bust.stl can be built." if content["stl"] else "No STL was written.",
-        reasons=reasons,
-        sections=[scan_section, map_section],
-        turntables=[report.Turntable(t.material, t.frames) for t in turntables],
-        findings=findings,
-        settings=json.dumps(content["settings"], indent=1),
-        provenance=provenance,
-    )
-
-
-def _brightness(scan: RangeScan) -> Any:
-    assert scan.brightness is not None
-    return np.rint(255 * np.nan_to_num(np.clip(scan.brightness, 0, 1))).astype(np.uint8)
