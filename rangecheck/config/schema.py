@@ -19,6 +19,27 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
 
 
+class Scanning(Section):
+    """What is done to scans before they become a surface."""
+
+    register: Literal["auto", "off", "poses", "turntable", "all"] = Field(
+        "auto",
+        description="auto: poses are moved only where the scans contradict them; off: taken as given; poses: refined; turntable: the scans "
+        "were taken in order around one axis; all: nothing is known of them",
+    )
+    misfits: Literal["refuse", "leave-out"] = Field(
+        "refuse", description="scans that could not be placed: the whole job is refused, or they are left out and named"
+    )
+    filters: tuple[Literal["flying", "isolated", "oblique", "smooth"], ...] = Field(
+        (), description="in this order; each says what it removed"
+    )
+    most_oblique_deg: Annotated[float, Field(gt=0, le=89)] = Field(80.0, description="oblique: from the normal")
+    least_patch_cells: Annotated[int, Field(ge=1)] = Field(20, description="isolated: smaller patches go")
+    smooth_cells: Annotated[int, Field(ge=2, le=8)] = Field(3, description="smooth: half width of the window")
+    quality: bool = Field(True, description="measure what the scans are worth, with the next view")
+    profile: str = Field("bust-150", description="what they are judged for: bust-75, bust-150 or bust-300")
+
+
 class Meshing(Section):
     """From scans to one surface."""
 
@@ -30,6 +51,12 @@ class Meshing(Section):
         80.0,
         description="a grid triangle whose normal leans further than this from the line of sight is a depth jump and is left out",
     )
+    closing: Literal["open", "half", "closed"] | None = Field(
+        None,
+        description="what nobody measured: left open, closed up to largest_hole_mm, or closed; without it, as the method does",
+    )
+    largest_hole_mm: Positive | None = Field(None, description="half: extent of the largest hole that is closed")
+    poisson_engine: Literal["open3d", "pymeshlab"] = "open3d"
 
 
 class Solidify(Section):
@@ -50,6 +77,32 @@ class Picture(Section):
     width: Annotated[int, Field(ge=8, le=16384)] = 512
     height: Annotated[int, Field(ge=8, le=16384)] = 512
     field_of_view_deg: Annotated[float, Field(gt=0.5, lt=150)] = Field(25.0, description="horizontal")
+    distortion: Annotated[tuple[float, ...], Field(max_length=8)] = Field(
+        (), description="k1 k2 p1 p2 k3 k4 k5 k6, as OpenCV orders them"
+    )
+    aperture_mm: Annotated[float, Field(ge=0, allow_inf_nan=False)] = Field(
+        0.0, description="diameter of the lens; 0 is a pinhole"
+    )
+    focus_mm: Positive | None = Field(None, description="depth in focus; without it, the middle of the object")
+    focal_length_mm: Positive = 50.0
+    rim_mm: Positive | None = Field(None, description="diameter of a rim that cuts oblique bundles")
+    rim_distance_mm: Annotated[float, Field(ge=0, allow_inf_nan=False)] = Field(0.0, description="of the rim before the aperture")
+    vignetting: bool = Field(False, description="image irradiance of equation (15): cos^4 and what the rim lets through")
+    exposure: Positive | None = Field(
+        None, description="radiance times it is the picture's level, 1 = white; without it, measured"
+    )
+
+
+class Sensor(Section):
+    """What counts the light: noise, response, numbers. Without noise pictures are sRGB of 8 bits."""
+
+    noise: bool = False
+    full_well: Positive = Field(20_000.0, description="electrons of a white pixel")
+    read_noise: Annotated[float, Field(ge=0, allow_inf_nan=False)] = Field(5.0, description="standard deviation, electrons")
+    dark_electrons: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    bits: Annotated[int, Field(ge=1, le=16)] = 8
+    response: Literal["linear", "srgb", "gamma"] = "srgb"
+    gamma: Annotated[float, Field(gt=0.1, lt=10)] = 2.2
 
 
 class Light(Section):
@@ -74,6 +127,15 @@ class Turntable(Section):
 
     frames: Annotated[int, Field(ge=1, le=100_000)] = 36
     elevation_deg: Degrees = 8.0
+    swing_deg: Degrees = Field(0.0, description="the camera rises and falls by this once per turn")
+    start_deg: Annotated[float, Field(allow_inf_nan=False)] = Field(0.0, description="azimuth of the first frame")
+    show: Literal["picture", "stripes", "distance", "id"] = Field(
+        "picture", description="stripes: bands of light mirrored by the surface, which bend where its slope does"
+    )
+    lights: Literal["model", "room"] = Field(
+        "model", description="model: the camera goes round model and lights; room: the model turns, camera and lights stand still"
+    )
+    frame_format: Literal["png", "exr"] = "png"
     margin: Annotated[float, Field(ge=0, lt=1)] = Field(0.06, description="share of the frame left free on every side")
     fps: Annotated[int, Field(ge=1, le=240)] = 12
 
@@ -106,9 +168,11 @@ class Settings(Section):
 
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     threads: Annotated[int, Field(ge=0, le=1024)] = Field(0, description="0 means all cores; results do not depend on it")
+    scan: Scanning = Scanning()
     meshing: Meshing = Meshing()
     solid: Solidify = Solidify()
     picture: Picture = Picture()
+    sensor: Sensor = Sensor()
     light: Light = Light()
     turntable: Turntable = Turntable()
     maps: Maps = Maps()

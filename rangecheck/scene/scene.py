@@ -140,6 +140,11 @@ class Scene:
         """The same things under other light."""
         return replace(self, sources=sources, surroundings=self.surroundings if surroundings is None else surroundings)
 
+    def lights_moved(self, motion: FloatArray) -> Scene:
+        """The same things under the same lights, carried along by a rigid motion (4, 4)."""
+        moved = tuple(replace(s, centre_mm=motion[:3, :3] @ s.centre_mm + motion[:3, 3]) for s in self.sources)
+        return self.lit_by(moved, self.surroundings.turned(motion[:3, :3]))
+
 
 def _distance_to_triangles(point: FloatArray, triangles: FloatArray) -> FloatArray:
     """(m,) distances of a point from triangles (m, 3, 3): to the plane where its foot lies inside, else to the nearest edge."""

@@ -81,6 +81,7 @@ class Surroundings:
     softness: float = 0.0
     picture: FloatArray | None = field(default=None, repr=False)
     boxes: tuple[Softbox, ...] = ()
+    ahead: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, -1.0]))
 
     def __post_init__(self) -> None:
         up = require("surroundings up", self.up, (3,), finite=True)
@@ -91,6 +92,14 @@ class Surroundings:
     def with_boxes(self, *boxes: Softbox) -> Surroundings:
         """The same with soft boxes added; their radiance adds to what is there."""
         return replace(self, boxes=self.boxes + boxes)
+
+    def turned(self, rotation: FloatArray) -> Surroundings:
+        """The same, carried round by a rotation (3, 3)."""
+        boxes = []
+        for box in self.boxes:
+            x, y, z = (float(c) for c in rotation @ np.asarray(box.up, float))
+            boxes.append(replace(box, towards=rotation @ box.towards, up=(x, y, z)))
+        return replace(self, up=rotation @ self.up, ahead=rotation @ self.ahead, boxes=tuple(boxes))
 
     @property
     def wavelengths(self) -> int:
@@ -109,7 +118,7 @@ class Surroundings:
         picture = self.picture if self.picture is not None else np.zeros((1, 1, 1), np.float32)
         return SurroundingsArrays(
             kind=self.kind,
-            frame=_frame(self.up, None),
+            frame=_frame(self.up, self.ahead),
             period=math.radians(self.period_deg) if self.period_deg else 1.0,
             softness=self.softness,
             low=spread("surroundings radiance", self.low),

@@ -62,6 +62,14 @@ class Tracer:
         twin._idle = []
         return twin
 
+    def lit_as(self, scene: Scene) -> Tracer:
+        """The same things under the lights of `scene`, which holds the same things and as many sources."""
+        twin = copy(self)
+        twin.scene = scene
+        twin.sources = sources_of(scene, self.caster, scene.channels)
+        twin.surroundings = scene.surroundings.arrays(scene.channels)
+        return twin
+
     def render(self, camera: Camera, world_from_camera: FloatArray, settings: Settings | None = None, *, seed: int = 0) -> Film:
         """The picture that `camera` takes from `world_from_camera` (4, 4), with the same bytes on any number of threads."""
         settings = settings or Settings()
