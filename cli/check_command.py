@@ -9,14 +9,14 @@ from .common import common, settings_from
 @click.argument("files", nargs=-1, required=True, type=click.Path())
 @click.option("--opinions", is_flag=True, help="Ask trimesh, MeshLab and manifold3d too.")
 @click.option("--printer", metavar="NAME", help="Judge for printing by a profile of configs/printers, or a profile file.")
-@common("unit", "config", "set")
-def command(files, opinions, printer, unit, config, assignments, reporter):
+@click.option("--profile", metavar="NAME", help="What scans are judged for: bust-75, bust-150 or bust-300.")
+@common("register", "filter", "unit", "config", "set")
+def command(files, opinions, printer, profile, register, filters, unit, config, assignments, reporter):
     """Check range scans or mesh files; verdict, findings with places, numbers.
 
     Exit status 0: fit; 1: not fit; 2: not readable.
     """
     from rangecheck.pipeline import check
 
-    return check(
-        files, settings=settings_from(config, assignments), unit=unit, opinions=opinions, printer=printer, reporter=reporter
-    )
+    settings = settings_from(config, assignments, scan__register=register, scan__filters=filters or None, scan__profile=profile)
+    return check(files, settings=settings, unit=unit, opinions=opinions, printer=printer, reporter=reporter)

@@ -78,6 +78,19 @@ _OPTIONS: dict[str, Callable[..., Any]] = {
     "set": click.option(
         "--set", "assignments", multiple=True, metavar="KEY=VALUE", help="One setting, for example turntable.frames=72."
     ),
+    "register": click.option(
+        "--register",
+        type=click.Choice(["auto", "off", "poses", "turntable", "all"]),
+        help="Poses of the scans. auto: moved only where the scans contradict them; off: taken as given; poses: refined; "
+        "turntable: taken in order around one axis; all: nothing is known.",
+    ),
+    "filter": click.option(
+        "--filter",
+        "filters",
+        multiple=True,
+        type=click.Choice(["flying", "isolated", "oblique", "smooth"]),
+        help="Filter the scans first; may be given several times, in order.",
+    ),
     "json": click.option("--json", "as_json", is_flag=True, help="Print one JSON document on stdout and nothing else."),
     "force": click.option("--force", is_flag=True, help="Replace existing results."),
 }

@@ -97,10 +97,10 @@ def exit_status(arguments: list[str] | None = None) -> int:
     except MemoryError:
         return _complain("out of memory; try a larger meshing.voxel_mm or smaller pictures")
     except Exception as error:
-        from rangecheck.errors import RangecheckError
+        from rangecheck.errors import PosesRefused, RangecheckError
 
         if isinstance(error, RangecheckError):
-            return _complain(str(error))
+            return _complain(str(error), status=1 if isinstance(error, PosesRefused) else 2)
         if isinstance(error, OSError):
             where = f"{error.filename}: " if error.filename else ""
             return _complain(f"{where}{error.strerror or error}")

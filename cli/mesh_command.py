@@ -8,11 +8,22 @@ from .common import common, settings_from
 @click.command("mesh", short_help="Turn scans into one surface and say by which method and why.")
 @click.argument("scans", nargs=-1, required=True, type=click.Path())
 @click.option("--method", type=click.Choice(["auto", "grid", "fuse", "poisson", "pivot"]), help="How scans become triangles.")
-@common("out_file", "unit", "config", "set", "force")
-def command(scans, method, out, unit, config, assignments, force, reporter):
-    """Turn scans into one surface and say by which method and why. MESH is a .ply, .obj, .glb or, if it is closed, .stl file."""
+@click.option("--closing", type=click.Choice(["open", "half", "closed"]), help="What becomes of what nobody measured.")
+@click.option("--largest-hole-mm", type=float, help="half: extent of the largest hole that is closed.")
+@common("out_file", "register", "filter", "unit", "config", "set", "force")
+def command(scans, method, closing, largest_hole_mm, out, register, filters, unit, config, assignments, force, reporter):
+    """Turn scans into one surface and say by which method and why.
+
+    SCANS are files, a folder, a manifest, a .conf with poses, or a folder of structured-light pictures. FILE is a .ply, .obj, .glb or, if it is closed, .stl file."""
     from rangecheck.pipeline import mesh
 
-    return mesh(
-        scans, out, settings=settings_from(config, assignments, meshing__method=method), unit=unit, force=force, reporter=reporter
+    settings = settings_from(
+        config,
+        assignments,
+        meshing__method=method,
+        meshing__closing=closing,
+        meshing__largest_hole_mm=largest_hole_mm,
+        scan__register=register,
+        scan__filters=filters or None,
     )
+    return mesh(scans, out, settings=settings, unit=unit, force=force, reporter=reporter)

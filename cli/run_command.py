@@ -9,12 +9,14 @@ from .common import common, settings_from
 @click.argument("scans", nargs=-1, required=True, type=click.Path())
 @click.option("--method", type=click.Choice(["auto", "grid", "fuse", "poisson", "pivot"]), help="How scans become triangles.")
 @click.option("--height-mm", type=float, help="Scale the finished bust to this height.")
-@common("out", "unit", "size", "frames", "tolerance", "seed", "config", "set", "force")
-def command(scans, method, height_mm, out, unit, size, frames, tolerance, seed, config, assignments, force, reporter):
+@common("out", "register", "filter", "unit", "size", "frames", "tolerance", "seed", "config", "set", "force")
+def command(
+    scans, method, height_mm, out, register, filters, unit, size, frames, tolerance, seed, config, assignments, force, reporter
+):
     """Do the whole job: mesh, check, close, render, measure, export STL, report.
 
-    SCANS are files, a folder, a manifest or a .conf with poses. DIR gets bust.stl (only of what is really solid), plaster.mp4,
-    steel.mp4, maps, report.html and run.json. A run that was stopped goes on where it was.
+    SCANS are files, a folder, a manifest, a .conf with poses, or a folder of structured-light pictures. DIR gets bust.stl (only of
+    what is really solid), plaster.mp4, steel.mp4, maps, report.html and run.json. A run that was stopped goes on where it was.
     """
     from rangecheck.pipeline import run
 
@@ -22,6 +24,8 @@ def command(scans, method, height_mm, out, unit, size, frames, tolerance, seed, 
         config,
         assignments,
         meshing__method=method,
+        scan__register=register,
+        scan__filters=filters or None,
         solid__height_mm=height_mm,
         turntable__frames=frames,
         light__tolerance_percent=tolerance,

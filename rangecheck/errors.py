@@ -58,6 +58,10 @@ class ScanError(RangecheckError):
     """The scans hold too little, or contradict each other, for what was asked of them."""
 
 
+class PosesRefused(ScanError):
+    """Scans could not be shown to belong together at any pose; what was inspected is not fit. `lines` says of each why."""
+
+
 class SurfaceError(RangecheckError):
     """A surface does not have the property that a step needs."""
 

@@ -10,10 +10,10 @@ from rangecheck.errors import OutputError
 from rangecheck.export.mapped import coloured_ids, contour_picture
 from rangecheck.export.pictures import write_png
 from rangecheck.pipeline.outcome import Outcome, document
-from rangecheck.pipeline.subject import hashes
+from rangecheck.pipeline.subject import decoded, hashes
 from rangecheck.pipeline.views import refuse_existing
 from rangecheck.progress import Reporter
-from rangecheck.scan.decode import DecodedScan, Reason, decode_gray_code, read_capture
+from rangecheck.scan.decode import DecodedScan, Reason
 from rangecheck.scan.readers.npz import write_npz
 
 REASONS = {
@@ -34,17 +34,7 @@ def decode(folder: str, out: str, *, pictures: bool, force: bool, reporter: Repo
     if target.suffix.lower() != ".npz":
         raise OutputError(out, "must end in .npz")
     refuse_existing(out, force)
-    with reporter.stage("reading pictures"):
-        capture = read_capture(folder)
-    with reporter.stage("decoding"):
-        found = decode_gray_code(
-            capture.left,
-            capture.left_view,
-            capture.right,
-            capture.right_view,
-            projector=capture.projector,
-            name=Path(folder).resolve().name,
-        )
+    found = decoded(folder, reporter)
     write_npz(target, found.scan, force=force)
     if pictures:
         _draw(found, target)

@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 
 from rangecheck.config import Settings
-from rangecheck.errors import InputError
+from rangecheck.errors import InputError, PosesRefused
 from rangecheck.files import sha256
 from rangecheck.pipeline.outcome import Outcome, document
+from rangecheck.pipeline.preparing import Measured, prepared
 from rangecheck.pipeline.shape import findings_lines
 from rangecheck.pipeline.subject import holds_scans, read_all_scans
 from rangecheck.progress import Reporter
-from rangecheck.scan import RangeScan
+from rangecheck.scan.point_cloud import PointCloud
 from rangecheck.solid.findings import catalogue
 from rangecheck.solid.findings import explain as explain_code
 from rangecheck.solid.opinions import Opinion
@@ -42,15 +43,9 @@ def check(
         if not path.exists():
             raise InputError(path, "does not exist; check the name")
         if holds_scans(path):
-            scans = read_all_scans([path], unit, reporter)
-            about = [scan_facts(scan) for scan in scans]
-            results.append({"file": file, "kind": "scans", "fit": True, "scans": about})
-            lines.append(f"{file}: {len(scans)} readable range scans")
-            lines += [
-                f"  {a['name']}: {a['width']}x{a['height']}, {a['valid']:,} distances ({a['valid_share']:.0%}), "
-                f"{a['nearest_mm']:.1f} to {a['farthest_mm']:.1f} mm, spacing {a['spacing_mm']:.2f} mm"
-                for a in about
-            ]
+            result, said = _check_scans(file, settings, unit, reporter)
+            results.append(result)
+            lines += said
             continue
         with reporter.stage("checking"):
             checked = check_mesh_file(
@@ -71,6 +66,30 @@ def check(
     return Outcome(document("check", fit=fit, files=results, seconds=reporter.seconds), lines, fit)
 
 
+def _check_scans(file: str, settings: Settings, unit: str | None, reporter: Reporter) -> tuple[dict[str, Any], list[str]]:
+    """What the scans of one path hold, whether they belong together, and what they are worth."""
+    scans = read_all_scans([file], unit, reporter)
+    about = [scan_facts(scan) for scan in scans]
+    lines = [f"{file}: {len(scans)} readable range scans"]
+    for a in about:
+        if a["camera"] is None:
+            lines.append(f"  {a['name']}: {a['valid']:,} points without a grid; what they are worth cannot be told")
+        else:
+            lines.append(
+                f"  {a['name']}: {a['width']}x{a['height']}, {a['valid']:,} distances ({a['valid_share']:.0%}), "
+                f"{a['nearest_mm']:.1f} to {a['farthest_mm']:.1f} mm, spacing {a['spacing_mm'] or 0.0:.2f} mm"
+            )
+    facts: dict[str, Any] = {"file": file, "kind": "scans", "scans": about}
+    try:
+        ready = prepared(scans, settings, reporter, quality=settings.scan.quality)
+    except PosesRefused as refusal:
+        facts |= {"fit": False, "registration": refusal.measured["registration"], "quality": None}
+        return facts, [*lines, *(f"  {line}" for line in refusal.measured["lines"])]
+    fit = ready.quality is None or ready.quality["verdict"] != "unfit"
+    facts |= {"fit": fit, "registration": ready.registration, "filtered": ready.filtered, "quality": ready.quality}
+    return facts, [*lines, *(f"  {line}" for line in ready.quality_lines)]
+
+
 def _word_of(opinion: Opinion) -> str:
     """One program's opinion in one line."""
     said = {True: "closed", False: "not closed", None: "gave no answer"}[opinion.closed]
@@ -80,8 +99,10 @@ def _word_of(opinion: Opinion) -> str:
     )
 
 
-def scan_facts(scan: RangeScan) -> dict[str, Any]:
-    """What a scan holds, in numbers."""
+def scan_facts(scan: Measured) -> dict[str, Any]:
+    """What a scan holds, in numbers; `camera` is None for a cloud."""
+    if isinstance(scan, PointCloud):
+        return {"name": scan.name, "camera": None, "unit": scan.unit, "valid": len(scan.points_mm), "valid_share": 1.0}
     ranges = scan.range_mm[scan.valid]
     points = scan.grid_points_mm
     with np.errstate(invalid="ignore"):

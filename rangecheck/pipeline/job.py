@@ -11,6 +11,7 @@ import numpy as np
 
 from rangecheck import report
 from rangecheck.config import Settings
+from rangecheck.errors import PosesRefused
 from rangecheck.export.map_files import write_maps
 from rangecheck.export.meshes import write_mesh
 from rangecheck.export.pictures import png_bytes
@@ -22,6 +23,8 @@ from rangecheck.pipeline.health import versions
 from rangecheck.pipeline.inspect import scan_facts
 from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.page import contours_of, page_of
+from rangecheck.pipeline.preparing import prepared
+from rangecheck.pipeline.scanning import refused
 from rangecheck.pipeline.shape import findings_lines, solid_of
 from rangecheck.pipeline.subject import eye_of, hashes, read_all_scans, surface_of
 from rangecheck.pipeline.turning import render_turntable
@@ -37,13 +40,18 @@ def run(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None,
     """Scans in; in `out` the bust's STL (of a solid only), turntables, maps, report.html and run.json."""
     check_free(out, FINISHED, force=force)
     find_encoder(".mp4")
-    read = read_all_scans(scans, unit, reporter)
     inputs = hashes(scans)
+    measured = read_all_scans(scans, unit, reporter)
+    try:
+        ready = prepared(measured, settings, reporter, quality=settings.scan.quality)
+    except PosesRefused as refusal:
+        return refused("run", refusal, reporter)
+    read = ready.grids
     key = key_of(inputs=inputs, unit=unit, settings=settings.model_dump(mode="json"), versions=versions())
     with job_folder(out, key, FINISHED, force=force) as folder:
         write_json(folder / "settings.json", document("settings", **settings.model_dump(mode="json")))
-        surface, method, reason = surface_of(read, settings, reporter)
-        made, judged = solid_of(surface, settings, reporter, eye_of(read))
+        surface, method, reason = surface_of(ready.scans, settings, reporter)
+        made, judged = solid_of(surface, settings, reporter, eye_of(ready.scans))
         shown = surface if made is None else made.surface
         judged = _with_scan_findings(judged, shown, settings)
         write_mesh(shown, folder / "surface.ply")
@@ -78,7 +86,8 @@ def run(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None,
         shares = {name: shown.share_of_area(origin) for origin, name in enumerate(ORIGIN_NAMES)}
         content = document(
             "run", fit=judged.fit, verdict=judged.to_dict(), stl=stl, method=method, reason=reason, area_shares=shares,
-            scans=[scan_facts(scan) for scan in read], faces=len(shown.faces), decisions=reporter.notes,
+            scans=[scan_facts(scan) for scan in ready.scans], quality=ready.quality, registration=ready.registration, filtered=ready.filtered,
+            faces=len(shown.faces), decisions=reporter.notes,
             turntables=[{"material": t.material, "film": t.film.name, "frames": len(t.frames), "plan": t.plan} for t in turntables],
             inputs=inputs, settings=settings.model_dump(mode="json"), versions=versions(), seconds=reporter.seconds,
             peak_memory_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
@@ -91,6 +100,7 @@ def run(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None,
     total = sum(reporter.seconds.values())
     lines = [
         f"{out}: {'fit' if judged.fit else 'not fit'}; {total:.1f} s",
+        *ready.quality_lines[:2],
         *findings_lines(judged),
         f"bust.stl: {stl['faces']:,} faces, read back and checked" if stl else "no STL: the findings above hold it back",
         f"look at {Path(out) / 'report.html'}",

@@ -49,7 +49,8 @@ def page_of(
     scan_section = report.Section(
         "Scans",
         "What came in: cells without a return stay without one, they are never points.",
-        [(fact["name"], f"{fact['valid']:,} distances, {fact['valid_share']:.0%} of the grid") for fact in content["scans"]],
+        [(fact["name"], f"{fact['valid']:,} distances, {fact['valid_share']:.0%} of the grid") for fact in content["scans"]]
+        + _worth(content["quality"]),
         pictures,
     )
     map_section = report.Section(
@@ -79,6 +80,20 @@ def page_of(
         settings=json.dumps(content["settings"], indent=1),
         provenance=provenance,
     )
+
+
+def _worth(quality: dict[str, Any] | None) -> list[tuple[str, str]]:
+    """What the scans are worth, as lines of a table."""
+    if quality is None:
+        return []
+    rows = [
+        ("worth", f"{quality['verdict']} for {quality['profile']['name']}"),
+        ("never seen", f"{quality['never_seen']:.1%} of the surface in reach, in {quality['gaps']} gaps"),
+        ("samples", f"{quality['spacing_mm']:.2f} mm apart"),
+        ("expected error", f"{quality['expected_error_mm']:.3f} mm"),
+    ]
+    rows += [(found["severity"], found["text"]) for found in quality["findings"]]
+    return rows + ([("next view", quality["next_view"]["reason"])] if quality["next_view"] else [])
 
 
 def _brightness(scan: RangeScan) -> Any:

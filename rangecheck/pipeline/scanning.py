@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rangecheck.config import Settings
-from rangecheck.errors import OutputError
+from rangecheck.errors import OutputError, PosesRefused
 from rangecheck.files import whole_file
 from rangecheck.pipeline.folder import check_free, check_writable
 from rangecheck.pipeline.outcome import Outcome, document
+from rangecheck.pipeline.preparing import prepared
 from rangecheck.pipeline.subject import hashes, read_all_scans, surface_of
 from rangecheck.progress import Reporter
 from rangecheck.surface import ORIGIN_NAMES
@@ -24,7 +25,11 @@ def mesh(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None
         raise OutputError(out, f"ends in {Path(out).suffix or 'nothing'}; a mesh ends in {', '.join(SUFFIXES)}")
     check_writable(out)
     read = read_all_scans(scans, unit, reporter)
-    surface, method, reason = surface_of(read, settings, reporter)
+    try:
+        ready = prepared(read, settings, reporter)
+    except PosesRefused as refusal:
+        return refused("mesh", refusal, reporter)
+    surface, method, reason = surface_of(ready.scans, settings, reporter)
     open_edges = len(boundary_edges(surface.faces))
     with reporter.stage("writing"):
         write_mesh(surface, out, force=force)
@@ -37,10 +42,20 @@ def mesh(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None
     return Outcome(
         document(
             "mesh", output=out, method=method, reason=reason, faces=len(surface.faces), vertices=len(surface.vertices),
-            boundary_edges=open_edges, shares=shares, inputs=hashes(scans), seconds=reporter.seconds, settings=settings.model_dump(mode="json"),
+            boundary_edges=open_edges, shares=shares, registration=ready.registration, filtered=ready.filtered, inputs=hashes(scans), seconds=reporter.seconds, settings=settings.model_dump(mode="json"),
         ),
         lines,
     )  # fmt: skip
+
+
+def refused(command: str, refusal: PosesRefused, reporter: Reporter) -> Outcome:
+    """No result, because the scans could not be shown to belong together."""
+    measured = refusal.measured
+    return Outcome(
+        document(command, fit=False, output=None, registration=measured["registration"], seconds=reporter.seconds),
+        [*measured["lines"], str(refusal).rsplit("; ", 1)[-1]],
+        False,
+    )
 
 
 def simulate(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rangecheck.arrays import FloatArray
 from rangecheck.config import Settings
@@ -12,9 +13,14 @@ from rangecheck.errors import InputError
 from rangecheck.files import read_bytes, sha256
 from rangecheck.modeler.model import Model
 from rangecheck.optics import PinholeCamera
+from rangecheck.pipeline.preparing import Measured, prepared
 from rangecheck.progress import Reporter
 from rangecheck.scan import RangeScan
+from rangecheck.scan.point_cloud import PointCloud
 from rangecheck.surface import Surface
+
+if TYPE_CHECKING:
+    from rangecheck.scan.decode import DecodedScan
 
 MESH_SUFFIXES = (".stl", ".obj", ".off", ".glb", ".3mf", ".ply")
 
@@ -30,6 +36,11 @@ class Subject:
     model: Model | None = None
 
 
+def holds_capture(path: Path) -> bool:
+    """Whether `path` is a folder of structured-light pictures."""
+    return path.is_dir() and ((path / "capture.json").is_file() or all((path / cam).is_dir() for cam in ("leftCam", "rightCam")))
+
+
 def holds_scans(path: Path) -> bool:
     """Whether `path` is read as range scans rather than as a mesh: by its kind, and for PLY by its header."""
     if path.is_dir() or path.suffix.lower() not in MESH_SUFFIXES:
@@ -37,29 +48,63 @@ def holds_scans(path: Path) -> bool:
     return path.suffix.lower() == ".ply" and b"range_grid" in read_bytes(path, 4096)
 
 
-def read_all_scans(paths: Sequence[str | Path], unit: str | None, reporter: Reporter) -> list[RangeScan]:
-    """Scans of all paths in order; each holds enough points to go on."""
-    from rangecheck.scan.readers import read_scans
+def decoded(folder: str | Path, reporter: Reporter) -> DecodedScan:
+    """The range scan of the structured-light pictures in `folder`."""
+    from rangecheck.scan.decode import decode_gray_code, read_capture
 
-    with reporter.stage("reading scans"):
-        scans = [scan for path in paths for scan in read_scans(path, unit)]
+    with reporter.stage("reading pictures"):
+        capture = read_capture(folder)
+    with reporter.stage("decoding"):
+        found = decode_gray_code(
+            capture.left,
+            capture.left_view,
+            capture.right,
+            capture.right_view,
+            projector=capture.projector,
+            name=Path(folder).resolve().name,
+        )
+    for what in found.lost:
+        reporter.note(f"lost: {what}")
+    return found
+
+
+def read_all_scans(paths: Sequence[str | Path], unit: str | None, reporter: Reporter) -> list[Measured]:
+    """What the scanners measured, of all paths in order, pictures decoded; each scan holds enough points to go on."""
+    from rangecheck.scan.readers import read_measured
+
+    scans: list[Measured] = []
+    for path in map(Path, paths):
+        if holds_capture(path):
+            scans.append(decoded(path, reporter).scan)
+            continue
+        with reporter.stage("reading scans"):
+            scans += read_measured(path, unit)
+    points = 0
     for scan in scans:
-        scan.need_points()
-    points = sum(int(scan.valid.sum()) for scan in scans)
+        points += len(scan.points_mm) if isinstance(scan, PointCloud) else int(scan.need_points().valid.sum())
     reporter.note(f"{len(scans)} scan{'s' if len(scans) != 1 else ''}, {points:,} distances")
     return scans
 
 
-def surface_of(scans: list[RangeScan], settings: Settings, reporter: Reporter) -> tuple[Surface, str, str]:
+def surface_of(scans: Sequence[Measured], settings: Settings, reporter: Reporter) -> tuple[Surface, str, str]:
     """One surface of all scans, the method that made it, and why that one."""
     from rangecheck.surface.meshing import choose_method, mesh_scans
 
-    method: str = settings.meshing.method
+    wanted = settings.meshing
+    method: str = wanted.method
     reason = "asked for"
     if method == "auto":
         method, reason = choose_method(scans)
     with reporter.stage("meshing"):
-        surface = mesh_scans(scans, method, voxel_mm=settings.meshing.voxel_mm, max_angle_deg=settings.meshing.max_angle_deg)
+        surface = mesh_scans(
+            scans,
+            method,
+            voxel_mm=wanted.voxel_mm,
+            max_angle_deg=wanted.max_angle_deg,
+            closing=wanted.closing,
+            largest_hole_mm=wanted.largest_hole_mm,
+            **({"engine": wanted.poisson_engine} if method == "poisson" else {}),
+        )
     reporter.note(f"meshed by {method}: {reason}; {len(surface.faces):,} faces")
     return surface, method, reason
 
@@ -77,9 +122,9 @@ def read_subject(path: str | Path, settings: Settings, unit: str | None, reporte
             model = read_model(where)
         return Subject(model.name, model.surface, method="modelled", model=model)
     if holds_scans(where):
-        scans = read_all_scans([where], unit, reporter)
-        surface, method, _ = surface_of(scans, settings, reporter)
-        return Subject(where.stem, surface, scans, method)
+        ready = prepared(read_all_scans([where], unit, reporter), settings, reporter)
+        surface, method, _ = surface_of(ready.scans, settings, reporter)
+        return Subject(where.stem, surface, ready.grids, method)
     with reporter.stage("reading mesh"):
         return Subject(where.stem, read_mesh(where, unit))
 
@@ -96,8 +141,8 @@ def hashes(paths: Sequence[str | Path]) -> dict[str, str]:
     return found
 
 
-def eye_of(scans: Sequence[RangeScan]) -> FloatArray | None:
+def eye_of(scans: Sequence[Measured]) -> FloatArray | None:
     """(3,) where a single scan was taken from, world frame; None for several scans, and where a scanner's rays are parallel."""
-    if len(scans) == 1 and isinstance(scans[0].camera, PinholeCamera):
+    if len(scans) == 1 and isinstance(scans[0], RangeScan) and isinstance(scans[0].camera, PinholeCamera):
         return scans[0].world_from_scan[:3, 3]
     return None

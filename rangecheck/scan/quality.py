@@ -175,6 +175,7 @@ def assess(
     elevation_deg: tuple[float, float] = (-30.0, 90.0),
     cells: int = 72,
     candidates: int = _CANDIDATES,
+    samples: Sequence[Samples] | None = None,
 ) -> ScanQuality:
     """Measure `scans` at their poses against `profile` (a name of PROFILES or one of your own).
 
@@ -182,13 +183,15 @@ def assess(
     elevation_deg  lowest and highest elevation from which a scanner could look
     cells          of the space along the object's longest side (8 to 400): gaps smaller than one are not found
     candidates     directions that the next view is chosen from
+    samples        those of the scans, if they are at hand
 
     Raises ScanError without scans or when one has no surface, SettingError for a setting out of its range."""
     wanted = _checked(scans, profile, elevation_deg, cells, candidates)
     upward = unit_vectors(require("up", up, (3,), finite=True))
     if not np.isfinite(upward).all():
         raise SettingError("up has length 0; say which way the object stands", key="up")
-    samples: list[Samples] = in_chunks(lambda i, _: samples_of(scans[i]), len(scans), 1)
+    if samples is None:
+        samples = in_chunks(lambda i, _: samples_of(scans[i]), len(scans), 1)
     poses = [s.world_from_scan for s in scans]
     judged = judge_all(samples, poses, Rules())
     step = _step_mm([pair for pair, *_ in judged.values()])
