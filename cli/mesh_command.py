@@ -23,7 +23,7 @@ def command(scans, method, closing, largest_hole_mm, out, register, filters, uni
         meshing__method=method,
         meshing__closing=closing,
         meshing__largest_hole_mm=largest_hole_mm,
-        scan__register=register,
+        scan__registration=register,
         scan__filters=filters or None,
     )
     return mesh(scans, out, settings=settings, unit=unit, force=force, reporter=reporter)

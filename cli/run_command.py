@@ -24,7 +24,7 @@ def command(
         config,
         assignments,
         meshing__method=method,
-        scan__register=register,
+        scan__registration=register,
         scan__filters=filters or None,
         solid__height_mm=height_mm,
         turntable__frames=frames,

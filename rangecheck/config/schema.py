@@ -22,7 +22,7 @@ class Section(BaseModel):
 class Scanning(Section):
     """What is done to scans before they become a surface."""
 
-    register: Literal["auto", "off", "poses", "turntable", "all"] = Field(
+    registration: Literal["auto", "off", "poses", "turntable", "all"] = Field(
         "auto",
         description="auto: poses are moved only where the scans contradict them; off: taken as given; poses: refined; turntable: the scans "
         "were taken in order around one axis; all: nothing is known of them",

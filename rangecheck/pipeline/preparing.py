@@ -43,10 +43,10 @@ def prepared(scans: Sequence[Measured], settings: Settings, reporter: Reporter, 
     if not grids:
         return Prepared(list(scans))
     grids, filtered = _filtered(grids, settings, reporter)
-    wanted = settings.scan.register
+    wanted = settings.scan.registration
     if clouds and wanted not in ("auto", "off"):
         raise SettingError(
-            f"{clouds[0].name} is a cloud, and clouds are taken where they are; use --register off", key="scan.register"
+            f"{clouds[0].name} is a cloud, and clouds are taken where they are; use --register off", key="scan.registration"
         )
     judged = len(grids) > 1 and not clouds and wanted != "off"
     samples: list[Samples] | None = None
@@ -122,7 +122,7 @@ def _placed(
 
     wanted = settings.scan
     guesses: dict[str, Guess] = {"poses": "poses", "turntable": "turntable", "all": "none"}
-    if wanted.register == "auto":
+    if wanted.registration == "auto":
         with reporter.stage("judging poses"):
             given = check_poses(scans, samples=samples)
         reporter.note(given.line)
@@ -130,7 +130,7 @@ def _placed(
             return scans, {"verdict": "given", "why": given.line, "pairs": [vars(p) for p in given.agreeing], "left_out": []}
         guess: Guess = "none" if given.missing else "poses"
     else:
-        guess = guesses[wanted.register]
+        guess = guesses[wanted.registration]
     with reporter.stage("registering"):
         result = register(scans, guess=guess, seed=settings.seed)
     for line in result.lines:
