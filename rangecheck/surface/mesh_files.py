@@ -92,8 +92,9 @@ def _format(path: Path, content: bytes) -> str:
 
 
 def _finite(path: Path, vertices: FloatArray, per_face: int) -> None:
-    bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
-    if len(bad):
+    finite = np.isfinite(vertices)
+    if not finite.all():
+        bad = np.flatnonzero(~finite.all(axis=1))
         where = f"{len(np.unique(bad // 3))} faces have corners" if per_face == 3 else f"{len(bad)} vertices have coordinates"
         name = "face" if per_face == 3 else "vertex"
         raise InputError(

@@ -14,8 +14,8 @@ import numpy as np
 
 from rangecheck.arrays import BoolArray, FloatArray, IntArray
 from rangecheck.kernels import kernel
+from rangecheck.surface.edges import grouped_half_edges, sorted_half_edges
 from rangecheck.surface.predicates import side_of_line
-from rangecheck.surface.topology import grouped_half_edges, sorted_half_edges
 
 #: a diagonal is turned when the sine of its two opposite angles' sum is below minus this: the rounding of a regular grid turns nothing
 _COCIRCULAR = 1e-9
