@@ -18,6 +18,7 @@ import numpy.typing as npt
 from rangecheck.arrays import FloatArray, require
 from rangecheck.errors import ArrayError, InputError
 from rangecheck.files import read_bytes, write_bytes
+from rangecheck.quick_look import srgb
 
 #: share of the lit pixels that an exposure keeps below white's `WHITE_LEVEL`; the rest are highlights, which may clip
 EXPOSED_SHARE = 0.98
@@ -54,12 +55,6 @@ def exposure_from(sequence: Iterable[FloatArray], share: float = EXPOSED_SHARE, 
         return 1.0
     levels = levels[levels >= LIT_SHARE * levels.max()]
     return white_level / float(np.quantile(levels, share))
-
-
-def srgb(linear: FloatArray) -> FloatArray:
-    """sRGB-encoded values 0..1 of linear levels, clipped to 0..1 first."""
-    x = np.clip(linear, 0.0, 1.0)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
 
 
 def develop(radiance: FloatArray, exposure: float = 1.0, background: float = 0.0) -> Picture:

@@ -112,6 +112,12 @@ class Material:
                     "choose wavelengths inside that range"
                 )
 
+    def _repr_html_(self) -> str:
+        """A notebook's look at the material: figure 3's polar plots of its components."""
+        from rangecheck.reflectance.charts import polar_chart
+
+        return polar_chart(self).decode()
+
     def strengths(self) -> FloatArray:
         """(4, wavelengths) K_lm, K_ss, K_sl, K_s. Raises SceneError where one has another number of values."""
         count = len(self.wavelengths_um)

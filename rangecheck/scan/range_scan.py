@@ -72,6 +72,13 @@ class RangeScan:
         """(n, 3) float64 valid points in the world frame, row by row."""
         return rigid.move_points(self.world_from_scan, self.grid_points_mm[self.valid])
 
+    def _repr_png_(self) -> bytes:
+        """A notebook's look at the scan: its relief under one light."""
+        from rangecheck.quick_look import LONGEST, grid_normals, shaded_png
+
+        step = max(1, -(-max(self.range_mm.shape) // LONGEST))
+        return shaded_png(grid_normals(self.grid_points_mm[::step, ::step]))
+
     def need_points(self, least: int = 3) -> RangeScan:
         """This scan, if it has at least `least` valid cells; raises ScanError otherwise."""
         count = int(self.valid.sum())

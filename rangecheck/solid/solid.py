@@ -39,12 +39,19 @@ class Solid:
             raise NotSolid("a Solid is made by Solid.from_surface(), which checks it; it cannot be claimed", findings=())
 
     @classmethod
-    def from_surface(cls, surface: Surface, *, notes: tuple[str, ...] = ()) -> Solid:
-        """`surface` as a Solid. Raises NotSolid, whose `findings` and `verdict` say why not and where."""
-        judged = check_solid(surface)
+    def from_surface(
+        cls, surface: Surface, *, notes: tuple[str, ...] = (), severities: Mapping[str, str] | None = None
+    ) -> Solid:
+        """`surface` as a Solid. `severities` overrides those of findings by code; what is in HARD stands against it whatever they say.
+        Raises NotSolid, whose `findings` and `verdict` say why not and where."""
+        judged = check_solid(surface, severities=severities)
         if not judged.fit or any(f.code in HARD for f in judged.findings):
             raise NotSolid(judged.sentence(), findings=judged.findings, verdict=judged)
         return cls(surface, judged, notes, _PROOF)
+
+    def _repr_png_(self) -> bytes:
+        """A notebook's look at the solid."""
+        return self.surface._repr_png_()
 
     @property
     def volume_mm3(self) -> float:
