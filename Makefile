@@ -12,7 +12,7 @@ demo: $(VENV)/.ready-demo
 	$(BIN)/rangecheck run sample_data --out $(OUT) --force
 
 test: $(VENV)/.ready-test
-	$(BIN)/pytest $(PYTEST_ARGS)
+	$(BIN)/pytest -n 2 --dist loadfile $(PYTEST_ARGS)
 
 lint: $(VENV)/.ready-test
 	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy && $(BIN)/lint-imports

@@ -9,10 +9,13 @@ import functools
 import json
 import sys
 from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from rangecheck import progress
 from rangecheck.progress import Reporter
 
 if TYPE_CHECKING:
@@ -92,6 +95,9 @@ _OPTIONS: dict[str, Callable[..., Any]] = {
         help="Filter the scans first; may be given several times, in order.",
     ),
     "json": click.option("--json", "as_json", is_flag=True, help="Print one JSON document on stdout and nothing else."),
+    "log": click.option(
+        "--log", type=click.Path(dir_okay=False), metavar="FILE", help="Append what is done, with the time, to FILE."
+    ),
     "force": click.option("--force", is_flag=True, help="Replace existing results."),
 }
 
@@ -110,21 +116,28 @@ def common(*names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(function)
-        def command(*args: Any, verbose: int, quiet: bool, threads: int | None, as_json: bool, **kwargs: Any) -> int:
+        def command(
+            *args: Any, verbose: int, quiet: bool, threads: int | None, as_json: bool, log: str | None, **kwargs: Any
+        ) -> int:
             if threads:
                 from rangecheck import kernels
 
                 kernels.set_threads(threads)
-            reporter = ConsoleReporter(-1 if quiet else verbose)
+            reporter = ConsoleReporter(-1 if quiet else verbose, Log(log) if log else None)
             try:
                 outcome: Outcome = function(*args, reporter=reporter, **kwargs)
+                for line in outcome.lines:
+                    reporter.remember(line)
+            except BaseException as error:
+                reporter.remember(f"{type(error).__name__}: {error}")
+                raise
             finally:
                 reporter.close()
             return show(outcome, as_json)
 
         command = click.option("-q", "--quiet", is_flag=True, help="No progress, no notes.")(command)
         command = click.option("-v", "--verbose", count=True, help="More about what is done.")(command)
-        for name in reversed(("json", "threads")):
+        for name in reversed(("json", "threads", "log")):
             command = _OPTIONS[name](command)
         for name in reversed(names):
             command = _OPTIONS[name](command)
@@ -143,12 +156,37 @@ def show(outcome: Outcome, as_json: bool) -> int:
     return 0 if outcome.fit else 1
 
 
-class ConsoleReporter(Reporter):
-    """Progress on stderr: a live bar on a terminal, one plain line a stage elsewhere."""
+class Log:
+    """Lines with the time (UTC), appended to a file. Raises OutputError at once when it cannot be written."""
 
-    def __init__(self, verbosity: int) -> None:
+    def __init__(self, path: str) -> None:
+        from rangecheck.errors import OutputError
+
+        try:
+            Path(path).parent.mkdir(parents=True, exist_ok=True)
+            self._file = Path(path).open("a", encoding="utf-8")  # noqa: SIM115 - closed by the reporter
+        except OSError as error:
+            raise OutputError(path, f"cannot be written ({error.strerror}); choose another --log") from None
+        self.write(" ".join(sys.argv[1:]))
+
+    def write(self, text: str) -> None:
+        """One line, on the disk when this returns."""
+        self._file.write(f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%S.%f}"[:-3] + f"Z {text}\n")
+        self._file.flush()
+
+    def close(self) -> None:
+        """Write no more."""
+        self._file.close()
+
+
+class ConsoleReporter(Reporter):
+    """Progress on stderr: a live bar on a terminal, one plain line a stage elsewhere. With a log, everything goes there too."""
+
+    def __init__(self, verbosity: int, log: Log | None = None) -> None:
         super().__init__()
         self.verbosity = verbosity
+        self._log = log
+        progress.on_first_compile = lambda: self._say("compiling kernels for this machine: only the first start takes this long")
         self._bar: Any = None
         self._task: Any = None
         if verbosity >= 0 and sys.stderr.isatty():
@@ -168,6 +206,15 @@ class ConsoleReporter(Reporter):
 
     def note(self, text: str) -> None:
         super().note(text)
+        self._say(text)
+
+    def remember(self, text: str) -> None:
+        """Into the log, where there is one."""
+        if self._log is not None:
+            self._log.write(text)
+
+    def _say(self, text: str) -> None:
+        self.remember(text)
         if self.verbosity < 0:
             return
         if self._bar is not None:
@@ -176,6 +223,7 @@ class ConsoleReporter(Reporter):
             click.echo(text, err=True)
 
     def begin(self, name: str, total: int) -> None:
+        self.remember(f"{name} ...")
         if self._bar is not None:
             self._task = self._bar.add_task(name, total=total or 1)
 
@@ -184,6 +232,7 @@ class ConsoleReporter(Reporter):
             self._bar.update(self._task, completed=done)
 
     def end(self, name: str, seconds: float) -> None:
+        self.remember(f"{name}: {seconds:.1f} s")
         if self._bar is not None and self._task is not None:
             total = self._bar.tasks[self._task].total
             self._bar.update(self._task, completed=total)
@@ -192,7 +241,10 @@ class ConsoleReporter(Reporter):
             click.echo(f"{name}: {seconds:.1f} s", err=True)
 
     def close(self) -> None:
-        """Leave the terminal as it was."""
+        """Leave the terminal as it was, and the log whole."""
+        progress.on_first_compile = None
+        if self._log is not None:
+            self._log.close()
         if self._bar is not None:
             self._bar.stop()
             self._bar = None

@@ -29,6 +29,8 @@ COMMANDS = {
     "study": "Chart speed against accuracy, and find where methods break.",
     "materials": "List materials, plot their lobes, print their energy table.",
     "explain": "Say what a finding means, why it matters and what mends it.",
+    "init": "Write a settings file with every setting, its default, range and meaning.",
+    "completion": "Print the script that lets a shell complete commands and options.",
     "doctor": "Say what is installed, what is missing, and the line that mends it.",
 }
 

@@ -9,16 +9,32 @@ from .common import common, settings_from
 @click.argument("scans", nargs=-1, required=True, type=click.Path())
 @click.option("--method", type=click.Choice(["auto", "grid", "fuse", "poisson", "pivot"]), help="How scans become triangles.")
 @click.option("--height-mm", type=float, help="Scale the finished bust to this height.")
+@click.option("--dry-run", is_flag=True, help="Check inputs, settings, encoder and room on the disk; compute nothing.")
 @common("out", "register", "filter", "unit", "size", "frames", "tolerance", "seed", "config", "set", "force")
 def command(
-    scans, method, height_mm, out, register, filters, unit, size, frames, tolerance, seed, config, assignments, force, reporter
+    scans,
+    method,
+    height_mm,
+    out,
+    register,
+    filters,
+    unit,
+    size,
+    frames,
+    tolerance,
+    seed,
+    config,
+    assignments,
+    force,
+    dry_run,
+    reporter,
 ):
     """Do the whole job: mesh, check, close, render, measure, export STL, report.
 
     SCANS are files, a folder, a manifest, a .conf with poses, or a folder of structured-light pictures. DIR gets bust.stl (only of
     what is really solid), plaster.mp4, steel.mp4, maps, report.html and run.json. A run that was stopped goes on where it was.
     """
-    from rangecheck.pipeline import run
+    from rangecheck.pipeline import rehearse, run
 
     settings = settings_from(
         config,
@@ -33,4 +49,4 @@ def command(
         picture__width=size and size[0],
         picture__height=size and size[1],
     )
-    return run(scans, out, settings=settings, unit=unit, force=force, reporter=reporter)
+    return (rehearse if dry_run else run)(scans, out, settings=settings, unit=unit, force=force, reporter=reporter)

@@ -23,7 +23,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
-from numba.core import caching, config
+from numba.core import caching, config, event
+
+from rangecheck import progress
 
 T = TypeVar("T")
 _PACKAGE = Path(__file__).resolve().parent
@@ -105,6 +107,8 @@ def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         config.CACHE_LOCATOR_CLASSES = _LOCATORS
         try:
             return numba.njit(cache=True, error_model="numpy", nogil=True, **options)(function)
+        except RuntimeError:  # no folder for compiled kernels can be written: every start compiles anew
+            return numba.njit(error_model="numpy", nogil=True, **options)(function)
         finally:
             config.CACHE_LOCATOR_CLASSES = before
 
@@ -117,8 +121,25 @@ inline_kernel = _compiled(inline="always")
 #: the same, for kernels that create no arrays: without them numba need not count references, which in a loop over rays that hands
 #: arrays to smaller kernels costs more than the work itself
 stage_kernel = _compiled(_nrt=False)
+#: the same, pasted by the compiler's back end, which costs less to compile: for what would hand whole queues over, ray by ray
+pasted_kernel = _compiled(_nrt=False, forceinline=True)
 
 _threads = 0
+
+
+class _FirstCompile(event.Listener):
+    """Tells that kernels are being compiled, which takes long and happens once on a machine."""
+
+    def on_start(self, event: event.Event) -> None:
+        tell, progress.on_first_compile = progress.on_first_compile, None
+        if tell is not None:
+            tell()
+
+    def on_end(self, event: event.Event) -> None:
+        pass
+
+
+event.register("numba:compile", _FirstCompile())
 
 
 def thread_count() -> int:

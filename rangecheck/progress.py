@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+
+#: called once, when the first kernel of this process has to be compiled because none was kept
+on_first_compile: Callable[[], None] | None = None
 
 
 class Reporter:

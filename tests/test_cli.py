@@ -2,13 +2,17 @@
 
 import importlib
 import json
+import re
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import click
 import numpy as np
 import pytest
 from rangecheck_cli.main import COMMANDS, exit_status
+
+from rangecheck.config import load_settings
 
 
 def complaint(capsys, *arguments) -> str:
@@ -103,3 +107,46 @@ def test_json_is_one_document_and_nothing_else(capsys):
     document = json.loads(capsys.readouterr().out)
     assert document["schema"] == "rangecheck/doctor/1"
     assert {row["name"] for row in document["checks"]} >= {"numpy", "embreex", "encoder"}
+
+
+def test_a_rehearsal_says_what_a_job_would_need_and_leaves_nothing(capsys, tmp_path, sample_data):
+    assert exit_status(["run", str(sample_data / "frontal"), "--out", str(tmp_path / "out"), "--dry-run", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["scans"] == 1 and told["distances"] > 10_000 and 0 < told["bytes_needed"] < told["bytes_free"]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_rehearsal_refuses_a_disk_that_is_too_small(capsys, tmp_path, sample_data, monkeypatch):
+    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=1_000_000))
+    said = complaint(capsys, "run", sample_data / "frontal", "--out", tmp_path / "out", "--dry-run")
+    assert "1 MB free" in said
+
+
+def test_a_new_settings_file_changes_nothing_until_a_line_is_uncommented(capsys, tmp_path):
+    file = tmp_path / "settings.toml"
+    assert exit_status(["init", "-o", str(file)]) == 0
+    assert load_settings(file) == load_settings()
+    text = file.read_text()
+    uncommented = re.sub(r"^# (\w+ = )", r"\1", text, flags=re.MULTILINE)
+    file.write_text(uncommented)
+    assert load_settings(file) == load_settings()  # every default is written as TOML
+    file.write_text(text.replace("# frames = 36", "frames = 7"))
+    assert load_settings(file).turntable.frames == 7
+    capsys.readouterr()
+    assert "exists already" in complaint(capsys, "init", "-o", file)
+
+
+def test_shells_are_told_how_to_complete(capsys):
+    for shell in ("bash", "zsh", "fish"):
+        assert exit_status(["completion", shell]) == 0
+        assert "_RANGECHECK_COMPLETE" in capsys.readouterr().out
+
+
+def test_a_log_holds_what_was_done_and_how_it_ended(capsys, tmp_path):
+    log = tmp_path / "logs" / "a b.log"
+    assert exit_status(["explain", "open-edges", "--log", str(log)]) == 0
+    capsys.readouterr()
+    complaint(capsys, "check", tmp_path / "none.ply", "--unit", "mm", "--log", log)
+    lines = log.read_text().splitlines()
+    assert any("open-edges" in line for line in lines) and "does not exist" in lines[-1]
+    assert all(re.match(r"\d{4}-\d\d-\d\dT[\d:.]+Z ", line) for line in lines)

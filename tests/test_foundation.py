@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rangecheck import arrays, errors, files, kernels, rigid
+from rangecheck import arrays, errors, files, kernels, progress, rigid
 from rangecheck.config import load_settings
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -143,3 +143,13 @@ def test_a_changed_source_changes_the_key_of_kernels_that_import_it(tmp_path, mo
     (folder / "constants.py").write_text("SIZE = 4\n")
     assert key() != before
     kernels.sources_of.cache_clear()
+
+
+def test_where_no_cache_can_be_written_kernels_compile_all_the_same(monkeypatch):
+    for locator in (kernels.GivenFolder, kernels.BesideSource, kernels.UserCache):
+        monkeypatch.setattr(locator, "from_function", classmethod(lambda cls, function, file: None))
+    told = []
+    monkeypatch.setattr(progress, "on_first_compile", lambda: told.append("compiling"))
+    twice = kernels.kernel(lambda x: 2 * x)
+    assert twice(21) == 42 and twice(2) == 4
+    assert told == ["compiling"]

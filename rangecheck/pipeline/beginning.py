@@ -1,0 +1,133 @@
+"""Before the work: a commented settings file to start from, and a rehearsal of a job that computes nothing."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from annotated_types import Ge, Gt, Le, Lt
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from rangecheck.config import Settings
+from rangecheck.errors import OutputError
+from rangecheck.export.video import find_encoder
+from rangecheck.files import write_bytes
+from rangecheck.pipeline.folder import check_free
+from rangecheck.pipeline.job import FINISHED
+from rangecheck.pipeline.outcome import Outcome, document
+from rangecheck.pipeline.subject import read_all_scans
+from rangecheck.progress import Reporter
+from rangecheck.reflectance import load_material
+
+#: bytes that a job leaves: of a face in the STL and the surface (their faces are at most three a distance), of a pixel of a frame
+#: with its film, of a pixel of the maps at one focal point
+BYTES_A_FACE, FACES_A_DISTANCE = 50 + 30, 3
+BYTES_A_PIXEL, BYTES_A_MAP_PIXEL = 1.5, 16
+#: the report, contour pictures and what else does not grow
+BYTES_BESIDES = 20_000_000
+
+
+def init(out: str, *, force: bool) -> Outcome:
+    """Write every setting with its default, range and meaning to `out`, each line a comment until it is changed."""
+    if Path(out).suffix.lower() != ".toml":
+        raise OutputError(out, "must end in .toml")
+    lines = ["# Settings of rangecheck. Take the # away from a line to change it; what stays a comment keeps its default.", ""]
+    lines += _section(Settings, "")
+    write_bytes(out, ("\n".join(lines) + "\n").encode(), force=force)
+    return Outcome(
+        document("init", output=out), [f"{out}: every setting with its default", f"use it with: rangecheck run SCANS --config {out} --out DIR"]
+    )  # fmt: skip
+
+
+def _section(model: type[BaseModel], name: str) -> Iterator[str]:
+    """The lines of a section: its own settings first, then the sections within."""
+    below = []
+    if name:
+        yield f"[{name}]"
+    for key, field in model.model_fields.items():
+        default = field.get_default(call_default_factory=True)
+        if isinstance(default, BaseModel):
+            below.append((key, type(default)))
+            continue
+        told = ". ".join(filter(None, (field.description, _range_of(field))))
+        if told:
+            yield f"# {told}"
+        yield f"# {key} = {_toml(default)}" if default is not None else f"# {key} ="
+    for key, section in below:
+        yield ""
+        yield from _section(section, f"{name}.{key}" if name else key)
+
+
+def _range_of(field: FieldInfo) -> str:
+    words = {Ge: "at least", Gt: "above", Le: "at most", Lt: "below"}
+    bounds = [
+        f"{said} {getattr(part, kind.__name__.lower()):g}"
+        for part in field.metadata
+        for kind, said in words.items()
+        if isinstance(part, kind)
+    ]
+    choices = _choices(field.annotation)
+    return "; ".join(filter(None, (" and ".join(bounds), f"one of {', '.join(map(_toml, choices))}" if choices else "")))
+
+
+def _choices(annotation: Any) -> tuple[Any, ...]:
+    from typing import Literal, get_args, get_origin
+
+    if get_origin(annotation) is Literal:
+        return get_args(annotation)
+    return next((found for part in get_args(annotation) if (found := _choices(part))), ())
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{json.dumps(k)} = {_toml(v)}" for k, v in value.items()) + " }" if value else "{}"
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    return json.dumps(value)
+
+
+def rehearse(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None, force: bool, reporter: Reporter) -> Outcome:
+    """What `run` would start with, checked without computing anything: inputs, settings, materials, encoder, folder, room on the disk."""
+    check_free(out, FINISHED, force=force)
+    encoder = find_encoder(".mp4")
+    materials = [load_material(name) for name in settings.light.materials]
+    measured = read_all_scans(scans, unit, reporter)
+    from rangecheck.scan import RangeScan
+
+    distances = sum(int(one.valid.sum()) if isinstance(one, RangeScan) else len(one.points_mm()) for one in measured)
+    pixels = settings.picture.width * settings.picture.height
+    needed = int(
+        distances * FACES_A_DISTANCE * BYTES_A_FACE
+        + pixels * settings.turntable.frames * len(materials) * BYTES_A_PIXEL
+        + pixels * len(settings.maps.azimuths_deg) * BYTES_A_MAP_PIXEL
+        + BYTES_BESIDES
+    )
+    free = shutil.disk_usage(_nearest_existing(Path(out))).free
+    if free < needed:
+        raise OutputError(
+            out, f"may need {needed / 1e6:,.0f} MB and has {free / 1e6:,.0f} MB free; make room, choose another folder, or smaller pictures"
+        )  # fmt: skip
+    lines = [
+        f"{len(measured)} scan{'s' if len(measured) != 1 else ''}, {distances:,} distances, can be read",
+        f"materials: {', '.join(material.name for material in materials)}; {settings.turntable.frames} frames of "
+        f"{settings.picture.width}x{settings.picture.height} each",
+        f"encoder: {encoder}",
+        f"{out}: free to use; at most {needed / 1e6:,.0f} MB are needed, {free / 1e6:,.0f} MB are free",
+        "nothing was computed; leave --dry-run away to begin",
+    ]
+    return Outcome(
+        document("rehearsal", scans=len(measured), distances=distances, bytes_needed=needed, bytes_free=free, encoder=encoder,
+                 settings=settings.model_dump(mode="json")),
+        lines,
+    )  # fmt: skip
+
+
+def _nearest_existing(path: Path) -> Path:
+    path = path.absolute()
+    while not path.exists():
+        path = path.parent
+    return path
