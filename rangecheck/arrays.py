@@ -50,8 +50,9 @@ def require(
         wanted = "(" + ", ".join("n" if n is None else str(n) for n in shape) + ")"
         raise ArrayError(f"{name} has shape {array.shape}; it must be {wanted}", name=name, shape=array.shape)
     if finite and array.dtype.kind == "f":
-        bad = np.argwhere(~np.isfinite(array))
-        if len(bad):
+        good = np.isfinite(array)
+        if not good.all():
+            bad = np.argwhere(~good)
             raise ArrayError(
                 f"{name} has {len(bad)} values that are not finite, the first at index {tuple(bad[0].tolist())}; remove them first",
                 name=name,

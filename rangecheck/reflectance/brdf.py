@@ -16,14 +16,15 @@ import numpy.typing as npt
 
 from rangecheck.arrays import FloatArray, IntArray, require
 from rangecheck.errors import ArrayError
-from rangecheck.kernels import in_chunks, kernel
+from rangecheck.kernels import in_chunks, inline_kernel, kernel
 from rangecheck.reflectance.energy import VISIBILITY_OCTAVES, lobe_albedo, rms_slope_of, visibility_table
-from rangecheck.reflectance.fast import lobe_fast, lobe_table
+from rangecheck.reflectance.fast import lobe_table
 from rangecheck.reflectance.lobe import (
     FAST,
     FORMS,
     MASKINGS,
     SMITH,
+    UNMASKED,
     V_GROOVE,
     lobe_geometry,
     scattering_sum,
@@ -31,11 +32,14 @@ from rangecheck.reflectance.lobe import (
     two_numbers,
     v_groove_masking,
 )
+from rangecheck.reflectance.many import fill_fast
 from rangecheck.reflectance.octaves import value_at
 from rangecheck.reflectance.sampling import scattered_direction, scattering_order
 from rangecheck.reflectance.series import log_lobe_series
 
-_CHUNK = 4096
+_CHUNK, _CHUNK_FAST = 4096, 32768
+#: azimuths beyond this (radians) are brought back to one turn first
+_MANY_TURNS = 1e4
 
 
 class KirchhoffWarning(UserWarning):
@@ -67,43 +71,66 @@ def lobe_brdf(
     correlation_um < wavelength_um."""
     form_number, masking_number = _choice("form", form, FORMS), _choice("masking", masking, MASKINGS)
     lengths = _lengths(sigma_um, correlation_um, wavelength_um)
-    azimuth = require("phi", phi, finite=True)
-    arrays = np.broadcast_arrays(_polar("theta_i", theta_i), _polar("theta_r", theta_r), azimuth, *two_numbers(*lengths))
-    shape = arrays[0].shape
-    flat = [np.ascontiguousarray(a, dtype=np.float64).reshape(-1) for a in arrays]
-    surface, seen = _visibilities(flat[3], flat[4], masking_number, bounded)
-    out = np.empty(flat[0].size)
-    series = lobe_table() if form_number == FAST else np.zeros((1, 1, 1))
+    azimuth = _azimuth(phi)
+    given = (_polar("theta_i", theta_i), _polar("theta_r", theta_r), azimuth, *two_numbers(*lengths))
+    shape = np.broadcast_shapes(*(np.shape(values) for values in given))
+    # a single value serves all without being spread
+    flat = [(a if np.size(a) == 1 or np.shape(a) == shape else np.broadcast_to(a, shape).copy()).reshape(-1) for a in given]
+    masks = masking_number != UNMASKED or bounded
+    surface, seen = _visibilities(*np.broadcast_arrays(flat[3], flat[4]), masking_number, bounded)
+    out = np.empty(shape).reshape(-1)
+    if form_number == FAST:
+        kept = [np.empty(out.size if masks else 0) for _ in range(3)]
+        table = lobe_table()
 
-    def work(start: int, stop: int) -> None:
-        _fill_lobe(form_number, masking_number, bounded, series, seen, surface, *flat, start, stop, out)
+        def work(start: int, stop: int) -> None:
+            fill_fast(table, *flat, start, stop, out, *kept)
+            if masks:
+                _mask(masking_number, bounded, seen, surface, flat[3], flat[4], *kept, start, stop, out)
+    else:
 
-    in_chunks(work, out.size, _CHUNK)
+        def work(start: int, stop: int) -> None:
+            _fill_lobe(form_number, masking_number, bounded, seen, surface, *flat, start, stop, out)
+
+    in_chunks(work, out.size, _CHUNK_FAST if form_number == FAST else _CHUNK)
     return out.reshape(shape)
 
 
+@inline_kernel
+def _masked(value, masking, bounded, seen, surface, roughness, reach, c_i, c_r, sxy2):
+    if bounded:
+        value *= value_at(seen, surface, 0, 0, c_i, VISIBILITY_OCTAVES) * value_at(seen, surface, 0, 0, c_r, VISIBILITY_OCTAVES)
+    elif masking == SMITH:
+        slope = math.sqrt(roughness / reach)
+        value *= smith_masking(c_i, slope) * smith_masking(c_r, slope)
+    if masking == V_GROOVE:
+        value *= v_groove_masking(c_i, c_r, sxy2)
+    return value
+
+
 @kernel
-def _fill_lobe(form, masking, bounded, series, seen, surface, theta_i, theta_r, phi, roughness, reach, start, stop, out):
+def _fill_lobe(form, masking, bounded, seen, surface, theta_i, theta_r, phi, roughness, reach, start, stop, out):
+    steps = (int(theta_i.size > 1), int(theta_r.size > 1), int(phi.size > 1), int(roughness.size > 1), int(reach.size > 1))
+    several = int(surface.size > 1)
     for n in range(start, stop):
-        c_i, c_r = math.cos(theta_i[n]), math.cos(theta_r[n])
-        in_plane = 2.0 * math.sin(0.5 * (theta_i[n] - theta_r[n])) * math.cos(0.5 * (theta_i[n] + theta_r[n]))
-        half_sine = math.sin(0.5 * phi[n])
-        sxy2 = in_plane * in_plane + 4.0 * math.sin(theta_i[n]) * math.sin(theta_r[n]) * half_sine * half_sine
-        if form == FAST:
-            u2 = (c_i + c_r) * (c_i + c_r)
-            value = lobe_fast(series, roughness[n] * u2, reach[n] * sxy2)
-        else:
-            value = scattering_sum(form, roughness[n], reach[n], c_i, c_r, sxy2)
-        value *= lobe_geometry(reach[n], c_i, c_r, sxy2)
-        if bounded:
-            k = surface[n]
-            value *= value_at(seen, k, 0, 0, c_i, VISIBILITY_OCTAVES) * value_at(seen, k, 0, 0, c_r, VISIBILITY_OCTAVES)
-        elif masking == SMITH:
-            slope = math.sqrt(roughness[n] / reach[n])
-            value *= smith_masking(c_i, slope) * smith_masking(c_r, slope)
-        if masking == V_GROOVE:
-            value *= v_groove_masking(c_i, c_r, sxy2)
-        out[n] = value
+        one, other, around = theta_i[n * steps[0]], theta_r[n * steps[1]], phi[n * steps[2]]
+        rough, far = roughness[n * steps[3]], reach[n * steps[4]]
+        c_i, c_r = math.cos(one), math.cos(other)
+        in_plane = 2.0 * math.sin(0.5 * (one - other)) * math.cos(0.5 * (one + other))
+        half_sine = math.sin(0.5 * around)
+        sxy2 = in_plane * in_plane + 4.0 * math.sin(one) * math.sin(other) * half_sine * half_sine
+        value = scattering_sum(form, rough, far, c_i, c_r, sxy2) * lobe_geometry(far, c_i, c_r, sxy2)
+        out[n] = _masked(value, masking, bounded, seen, surface[n * several], rough, far, c_i, c_r, sxy2)
+
+
+@kernel
+def _mask(masking, bounded, seen, surface, roughness, reach, cosines_i, cosines_r, asides, start, stop, out):
+    many, several, longer = int(roughness.size > 1), int(surface.size > 1), int(reach.size > 1)
+    for n in range(start, stop):
+        out[n] = _masked(
+            out[n], masking, bounded, seen, surface[n * several], roughness[n * many], reach[n * longer],
+            cosines_i[n], cosines_r[n], asides[n],
+        )  # fmt: skip
 
 
 def spike_reflectance(theta_i: npt.ArrayLike, *, sigma_um: npt.ArrayLike, wavelength_um: npt.ArrayLike) -> FloatArray:
@@ -213,13 +240,22 @@ def _choice(name: str, word: str, words: dict[str, int]) -> int:
 
 
 def _polar(name: str, values: npt.ArrayLike) -> FloatArray:
-    angles = require(name, values, finite=True)
+    angles = require(name, values)
+    # NaN is neither
     if angles.size and not (angles.min() >= 0.0 and angles.max() <= 0.5 * np.pi):
+        require(name, angles, finite=True)
         raise ArrayError(
             f"{name} spans {angles.min():.6g} to {angles.max():.6g}; polar angles are 0 to pi/2 radians from the normal",
             name=name,
         )
     return angles
+
+
+def _azimuth(phi: npt.ArrayLike) -> FloatArray:
+    azimuth = require("phi", phi)
+    if azimuth.size and not (azimuth.min() > -_MANY_TURNS and azimuth.max() < _MANY_TURNS):
+        azimuth = np.remainder(require("phi", azimuth, finite=True), 2.0 * np.pi)
+    return azimuth
 
 
 def _length(name: str, values: npt.ArrayLike) -> FloatArray:

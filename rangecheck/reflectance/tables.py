@@ -51,13 +51,13 @@ def lobe_value(surfaces, series, material, wave, c_i, c_r, sxy2):
     """K_lobe F f_lobe in sr^-1, masked and bounded as the material says. Symmetric in c_i and c_r; both must be > 0."""
     reach = surfaces[material, wave, REACH]
     u2 = (c_i + c_r) * (c_i + c_r)
-    value = lobe_fast(series, surfaces[material, wave, ROUGHNESS] * u2, reach * sxy2)
-    value *= surfaces[material, wave, K_LOBE] * lobe_geometry(reach, c_i, c_r, sxy2)
-    value *= visibility_at(surfaces, material, wave, c_i) * visibility_at(surfaces, material, wave, c_r)
-    value *= value_at(surfaces, material, wave, FRESNEL, 0.25 * (u2 + sxy2), FRESNEL_OCTAVES)
+    # what does not wait for the sum is multiplied while that is under way
+    value = surfaces[material, wave, K_LOBE] * lobe_geometry(reach, c_i, c_r, sxy2)
+    seen = visibility_at(surfaces, material, wave, c_i) * visibility_at(surfaces, material, wave, c_r)
+    value *= seen * value_at(surfaces, material, wave, FRESNEL, 0.25 * (u2 + sxy2), FRESNEL_OCTAVES)
     if surfaces[material, wave, MASKING] == V_GROOVE:
         value *= v_groove_masking(c_i, c_r, sxy2)
-    return value
+    return value * lobe_fast(series, surfaces[material, wave, ROUGHNESS] * u2, reach * sxy2)
 
 
 @inline_kernel

@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 
 from rangecheck.arrays import FloatArray
-from rangecheck.kernels import kernel
-from rangecheck.reflectance import directional_albedo, spike_reflectance
+from rangecheck.kernels import kernel, threads
+from rangecheck.reflectance import Material, directional_albedo, lobe_brdf, spike_reflectance
 from rangecheck.reflectance.energy import lobe_albedo, visibility_of, visibility_table
 from rangecheck.reflectance.fast import FAST_ERROR, lobe_fast, lobe_table
 from rangecheck.reflectance.lobe import MASKINGS, SMITH, two_numbers
 from rangecheck.reflectance.series import lobe_rough, lobe_series, lobe_smooth
+from rangecheck.reflectance.tables import lobe_value
 from rangecheck.study import Candidate, Edge, EdgeChart, Line, LineChart, Part, SpeedChart, find_edge, measure, study_of_parts
 
 GREEN_UM = 0.555
@@ -133,6 +134,59 @@ def _forms(points: int, evaluations: int, rounds: int) -> tuple[list[SpeedChart]
             for m in measured
         ]
     return charts, rows
+
+
+def _whole(evaluations: int, rounds: int) -> tuple[SpeedChart, list[dict[str, Any]]]:
+    """The lobe itself from three angles, as notebooks call it, checks and cosines included; and as the tracer calls it, from cosines,
+    masked, bounded, with Fresnel's share. Errors against the series at the same angles, within e^-30 of the peak."""
+    rng = np.random.default_rng(7)
+    theta_i = rng.uniform(0.0, 1.5, evaluations)
+    theta_r = np.clip(theta_i + rng.normal(0.0, 0.1, evaluations), 0.0, 1.55)
+    angles = (theta_i, theta_r, rng.normal(0.0, 0.2, evaluations))
+    candidates, errors = [], {}
+    for sigma, correlation in ((0.02, 3.0), (0.1, 3.0), (1.0, 10.0)):
+        surface = {"sigma_um": sigma, "correlation_um": correlation, "wavelength_um": GREEN_UM}
+        exact = lobe_brdf(*angles, form="series", **surface)
+        seen = exact > math.exp(-30.0) * exact.max()
+        for form in ("fast", "series"):
+            key = (f"lobe_brdf, {form}", f"σ {sigma:g} T {correlation:g}")
+            errors[key] = float(np.abs(lobe_brdf(*angles, form=form, **surface)[seen] / exact[seen] - 1.0).max())
+            candidates.append(Candidate(*key, partial(_called, lobe_brdf, angles, {"form": form, **surface}, key)))
+        key = ("tracer's lobe_value", f"σ {sigma:g} T {correlation:g}")
+        material = Material("surface", K_s=1.0, sigma_um=sigma, correlation_um=correlation, wavelengths_um=(GREEN_UM,))
+        cosines = [np.cos(theta_i), np.cos(theta_r)]
+        aside = (np.sin(theta_i) - np.sin(theta_r)) ** 2
+        aside += 4.0 * np.sin(theta_i) * np.sin(theta_r) * np.sin(0.5 * angles[2]) ** 2
+        out = np.empty(evaluations)
+        _by_tracer(*material.tables(), *cosines, aside, out)
+        masked = lobe_brdf(*angles, form="series", masking="smith", bounded=True, **surface)
+        errors[key] = float(np.abs(out[seen] / np.maximum(masked[seen], 1e-300) - 1.0).max())
+        candidates.append(Candidate(*key, partial(_called, _by_tracer, (*material.tables(), *cosines, aside, out), {}, key)))
+    with threads(1):
+        measured = measure(candidates, errors.__getitem__, rounds=rounds)
+    chart = SpeedChart(
+        "whole-lobe",
+        "The whole lobe: from angles, and as the tracer evaluates it",
+        "largest relative error, down to e^-30 of the peak",
+        "ns per evaluation, one core",
+        measured,
+        work=evaluations,
+        scale=1e9,
+    )
+    return chart, [
+        {"method": m.method, "setting": m.setting, "ns": m.seconds / evaluations * 1e9, "error": m.error} for m in measured
+    ]
+
+
+def _called(function: Callable[..., Any], given: tuple[Any, ...], named: dict[str, Any], key: tuple[str, str]) -> tuple[str, str]:
+    function(*given, **named)
+    return key
+
+
+@kernel
+def _by_tracer(surfaces, series, c_i, c_r, aside, out):
+    for n in range(out.size):
+        out[n] = lobe_value(surfaces, series, 0, 0, c_i[n], c_r[n], aside[n])
 
 
 def _timed(evaluate: Callable[..., None], g: FloatArray, a: FloatArray, out: FloatArray, key: tuple[str, str]) -> tuple[str, str]:
@@ -298,12 +352,17 @@ def _changes(steps: int) -> tuple[list[LineChart], list[dict[str, Any]]]:
 
 def _forms_part(quick: bool) -> Part:
     charts, rows = _forms(points=60 if quick else 200, evaluations=5_000 if quick else 50_000, rounds=5 if quick else 15)
+    whole, whole_rows = _whole(5_000 if quick else 100_000, 3 if quick else 15)
     said = [
+        f"{row['method']}, {row['setting']}: {row['ns']:.3g} ns per evaluation per core, error {row['error']:.2g}"
+        for row in whole_rows
+    ]
+    said += [
         f"{row['regime']} surface, {row['method']}{', ' + row['setting'] if row['setting'] else ''}: "
         f"{row['ns']:.3g} ns per evaluation per core, error {row['error']:.2g}"
         for row in rows
     ]
-    return Part(charts, said, {"forms": rows})
+    return Part([*charts, whole], said, {"forms": rows, "whole_lobe": whole_rows})
 
 
 def _limits_part(quick: bool) -> Part:
