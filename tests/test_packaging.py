@@ -1,0 +1,94 @@
+"""What is installed is whole: a wheel works outside the checkout, with its presets, and a source archive makes the same wheel."""
+
+import shutil
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+BUILD = "import sys; from setuptools import build_meta; print(getattr(build_meta, sys.argv[1])(sys.argv[2]))"
+
+
+def _build(source: Path, what: str, out: Path) -> Path:
+    out.mkdir(exist_ok=True)
+    said = subprocess.run(
+        [sys.executable, "-c", BUILD, what, str(out)], cwd=source, capture_output=True, text=True, check=True
+    ).stdout
+    return out / said.splitlines()[-1]
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory):
+    """What belongs to a release, without what tests and builds leave in a checkout."""
+    source = tmp_path_factory.mktemp("source") / "rangecheck 0"
+    source.mkdir()
+    for name in ("rangecheck", "cli", "configs"):
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE", "MANIFEST.in"):
+        if (ROOT / name).exists():
+            shutil.copy(ROOT / name, source)
+    return source
+
+
+@pytest.fixture(scope="module")
+def wheel(source, tmp_path_factory):
+    return _build(source, "build_wheel", tmp_path_factory.mktemp("wheel"))
+
+
+@pytest.fixture(scope="module")
+def installed(wheel, tmp_path_factory):
+    """A folder that holds the wheel and nothing of the checkout."""
+    site = tmp_path_factory.mktemp("site")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(site)
+    return site
+
+
+def _files(wheel: Path) -> set[str]:
+    with zipfile.ZipFile(wheel) as archive:
+        return {name for name in archive.namelist() if ".dist-info/" not in name}
+
+
+def test_the_wheel_holds_every_source_preset_and_page(source, wheel):
+    wanted = {
+        str(path.relative_to(source)).replace("cli/", "rangecheck_cli/", 1).replace("configs/", "rangecheck/presets/", 1)
+        for name in ("rangecheck", "cli", "configs")
+        for path in (source / name).rglob("*")
+        if path.is_file()
+    }
+    assert wanted - _files(wheel) == set()
+    assert not any("tests/" in name or "sample_data/" in name for name in _files(wheel))
+
+
+def test_the_source_archive_makes_the_same_wheel(source, wheel, tmp_path):
+    archive = _build(source, "build_sdist", tmp_path / "sdist")
+    with tarfile.open(archive) as opened:
+        opened.extractall(tmp_path, filter="data")
+    (unpacked,) = tmp_path.glob("rangecheck-*")
+    assert _files(_build(unpacked, "build_wheel", tmp_path / "again")) == _files(wheel)
+
+
+def _run(installed: Path, folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    code = "import sys; sys.path.insert(0, sys.argv.pop(1)); from rangecheck_cli import main; main()"
+    return subprocess.run(
+        [sys.executable, "-I", "-c", code, str(installed), *arguments],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+    )
+
+
+def test_the_wheel_works_outside_the_checkout(installed, tmp_path, sample_data):
+    where = "import sys; sys.path.insert(0, sys.argv[1]); import rangecheck, rangecheck_cli; print(rangecheck.__file__, rangecheck_cli.__file__)"
+    said = subprocess.run(
+        [sys.executable, "-I", "-c", where, str(installed)], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert all(path.startswith(str(installed)) for path in said.stdout.split())
+    listed = _run(installed, tmp_path, "materials")
+    assert listed.returncode == 0 and "plaster" in listed.stdout
+    done = _run(installed, tmp_path, "run", str(sample_data / "frontal"), "--dry-run", "--out", "out", "--config", "quick")
+    assert done.returncode == 0, done.stderr
