@@ -109,7 +109,7 @@ def radiance(index):
     return np.random.default_rng(index).uniform(0.5, 1.0 + index, (8, 8))
 
 
-def encode(image, exposure):
+def encode(image, exposure, index=0):
     return (image * exposure).tobytes()
 
 

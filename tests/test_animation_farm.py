@@ -13,7 +13,7 @@ pytest.importorskip("distributed", reason="the optional package distributed is n
 FRAMES = 12
 
 
-def encode(image, exposure):
+def encode(image, exposure, index=0):
     return (image * exposure).tobytes()
 
 

@@ -78,7 +78,7 @@ def render_frames(
     folder: str | Path,
     key: str | Mapping[str, Any],
     *,
-    encode: Callable[[FloatArray, float], bytes],
+    encode: Callable[[FloatArray, float, int], bytes],
     exposure: Callable[[Sequence[FloatArray]], float] | float = 1.0,
     suffix: str = ".png",
     force: bool = False,
@@ -87,7 +87,7 @@ def render_frames(
 ) -> list[Path]:
     """Make frames 0..frames-1 as files in `folder`, or those of them that are missing, and return their paths in order.
 
-    frame(index) is the radiance of one frame, a pure function of its number; encode(radiance, exposure) is its file. `exposure`
+    frame(index) is the radiance of one frame, a pure function of its number; encode(radiance, exposure, index) is its file. `exposure`
     is a number, or a function of the pilot frames' radiances, asked once before the first frame is written and then kept in the
     manifest. progress(done, frames) is called after each frame. An interruption leaves only whole files, and the next call with
     the same key goes on to the same bytes. With `spread` (see `farm`) frames are made elsewhere, and `frame` is not called here.
@@ -113,7 +113,7 @@ def render_frames(
     level = manifest["exposure"]
 
     def write(index: int, radiance: FloatArray) -> None:
-        content = encode(radiance, level)
+        content = encode(radiance, level, index)
         write_bytes(paths[index], content)
         done[paths[index].name] = hashlib.sha256(content).hexdigest()
         write_json(where / MANIFEST, manifest | {"done": dict(sorted(done.items()))})

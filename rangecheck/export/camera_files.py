@@ -18,6 +18,7 @@ from rangecheck.optics import Camera, PinholeCamera, camera_from_dict
 from rangecheck.rigid import checked, inverse, quaternion_from_rotation
 
 SCHEMA = "rangecheck/camera/1"
+LIST_SCHEMA = "rangecheck/cameras/1"
 
 
 def write_camera_json(
@@ -31,6 +32,24 @@ def write_camera_json(
         "camera": camera.to_dict(),
         "world_from_camera": pose.tolist(),
     }
+    write_json(path, document, force=force)
+
+
+def write_camera_list(
+    path: str | Path,
+    camera: Camera,
+    poses: Sequence[FloatArray],
+    names: Sequence[str],
+    more: Mapping[str, Any] | None = None,
+    *,
+    force: bool = True,
+) -> None:
+    """One camera and its pose in each picture of a sequence, as JSON."""
+    rows = [
+        {"picture": name, "world_from_camera": checked(pose, "world_from_camera").tolist()}
+        for name, pose in zip(names, poses, strict=True)
+    ]
+    document = dict(more or {}) | {"schema": LIST_SCHEMA, "length_unit": "mm", "camera": camera.to_dict(), "pictures": rows}
     write_json(path, document, force=force)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -45,6 +46,19 @@ def write_exr(path: str | Path, channels: Mapping[str, npt.NDArray[Any]], note: 
     header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage, "comments": note}
     with whole_file(path, force=force) as part, openexr.File(header, pixels) as file:
         file.write(str(part))
+
+
+def need_openexr() -> None:
+    """Raise DependencyMissing where EXR images cannot be written."""
+    _openexr("writing EXR images")
+
+
+def exr_bytes(channels: Mapping[str, npt.NDArray[Any]]) -> bytes:
+    """The file that `write_exr` writes."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "image.exr"
+        write_exr(path, channels)
+        return path.read_bytes()
 
 
 def radiance_channels(radiance: npt.NDArray[Any]) -> dict[str, npt.NDArray[Any]]:

@@ -10,27 +10,26 @@ import numpy as np
 from rangecheck.arrays import FloatArray
 from rangecheck.config import Settings
 from rangecheck.errors import OutputError
-from rangecheck.export.camera_files import write_camera_json
-from rangecheck.export.pictures import develop, exposure_from, write_png
+from rangecheck.export.camera_files import write_camera_json, write_colmap, write_opencv_yaml
+from rangecheck.export.pictures import exposure_from, write_png
 from rangecheck.optics import PinholeCamera
+from rangecheck.pipeline.camera import developed, image_of, optics_of, take
 from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.subject import Subject, read_subject
 from rangecheck.pipeline.views import refuse_existing, view_of
 from rangecheck.progress import Reporter
 from rangecheck.reflectance import Material, load_material
 from rangecheck.scene import Scene, Source, gradient, studio
-from rangecheck.transport import Film, Plan, Tracer, make_plan
+from rangecheck.transport import Plan, Tracer, make_plan
 from rangecheck.transport import Settings as LightSettings
-from rangecheck.transport import render as render_film
-
-#: radiance behind the object, where white that faces the key light has 1: an even, dark backdrop, whatever the surroundings
-BACKDROP = 0.05
 
 
-def scene_of(subject: Subject, material: Material, *, direct: bool = False) -> Scene:
+def scene_of(subject: Subject, material: Material, *, direct: bool = False, stripes: bool = False) -> Scene:
     """A modelled scene as its file says; any other surface in the studio that suits its material: soft boxes for what mirrors,
-    lamps for what does not - lamps alone where only their `direct` light is followed."""
+    lamps for what does not - lamps alone where only their `direct` light is followed. Or any surface among inspection `stripes`."""
     surface, model = subject.surface, subject.model
+    if stripes:
+        return studio(surface, material, "stripes", smooth=True)
     if model is not None and model.lamps:
         names = list(dict.fromkeys(name or material.name for name in model.material_of_part))
         return Scene(
@@ -45,11 +44,6 @@ def scene_of(subject: Subject, material: Material, *, direct: bool = False) -> S
     strengths = material.strengths().mean(axis=1)
     matt = strengths[0] > strengths[1:].sum()
     return studio(surface, material, ("dark" if direct else "plaster") if matt else "steel", smooth=True)
-
-
-def before_backdrop(film: Film) -> FloatArray:
-    """(h, w, c) radiance of the film in front of the backdrop."""
-    return film.radiance + (BACKDROP * (1 - film.coverage))[..., None].astype(film.radiance.dtype)
 
 
 def plan_of(tracer: Tracer, camera: PinholeCamera, pose: FloatArray, settings: Settings) -> Plan:
@@ -95,21 +89,22 @@ def render(
     material = load_material(settings.light.materials[0])
     subject = read_subject(path, settings, unit, reporter)
     camera, pose = view_of(subject, settings, camera_mm)
+    middle = float((subject.surface.bounds_mm.mean(axis=0) - pose[:3, 3]) @ pose[:3, 2])
+    optics = optics_of(settings, camera, middle)
     with reporter.stage("rendering"):
         tracer = Tracer(scene_of(subject, material, direct=settings.light.model == "direct"))
-        plan = plan_of(tracer, camera, pose, settings)
-        film = render_film(tracer, camera, pose, plan=plan, seed=settings.seed)
-    exposure = exposure_from([film.radiance])
-    write_png(out, develop(grey_or_colour(before_backdrop(film)), exposure), force=force)
-    write_camera_json(Path(out).with_suffix(".camera.json"), camera, pose)
-    lines = [f"{out}: {camera.width}x{camera.height}, {material.name}, mean radiance {film.mean_radiance:.4g}", *plan.explain()]
+        plan = plan_of(tracer, optics.camera, pose, settings)
+        film, said = take(tracer, optics, pose, plan, settings.seed)
+    exposure = settings.picture.exposure or exposure_from([film.radiance])
+    write_png(out, developed(image_of(film, optics), exposure, optics, settings.seed), force=force)
+    beside = Path(out)
+    write_camera_json(beside.with_suffix(".camera.json"), camera, pose, {"exposure": exposure, **optics.to_dict()})
+    write_opencv_yaml(beside.with_suffix(".opencv.yaml"), camera, pose)
+    write_colmap(beside.with_suffix(".colmap"), [camera], [pose], [beside.name.replace(" ", "_")])
+    explained = [*plan.explain(), *optics.reasons, *said]
+    lines = [f"{out}: {camera.width}x{camera.height}, {material.name}, mean radiance {film.mean_radiance:.4g}", *explained]
     return Outcome(
         document("render", output=out, material=material.name, camera=camera.to_dict(), world_from_camera=pose, exposure=exposure,
-                 film=film.to_dict(), plan=plan.explain(), seconds=reporter.seconds),
+                 film=film.to_dict(), plan=explained, seconds=reporter.seconds, **optics.to_dict()),
         lines,
     )  # fmt: skip
-
-
-def grey_or_colour(radiance: FloatArray) -> FloatArray:
-    """(h, w) where there is one wavelength, else (h, w, 3)."""
-    return radiance[..., 0] if radiance.shape[2] == 1 else radiance

@@ -3,63 +3,150 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
 
 from rangecheck import __version__
 from rangecheck.animation import Orbit, render_frames
+from rangecheck.animation.frames import MANIFEST
 from rangecheck.arrays import FloatArray
 from rangecheck.config import Settings
-from rangecheck.errors import OutputError
-from rangecheck.export.pictures import develop, exposure_from, png_bytes
+from rangecheck.errors import OutputError, SettingError
+from rangecheck.export import legend
+from rangecheck.export.camera_files import write_camera_list, write_colmap
+from rangecheck.export.exr import exr_bytes, need_openexr, radiance_channels, read_exr
+from rangecheck.export.mapped import contact_sheet
+from rangecheck.export.pictures import exposure_from, png_bytes, read_png, write_png
 from rangecheck.export.video import FORMATS, find_encoder, write_film
-from rangecheck.optics import PinholeCamera
+from rangecheck.files import read_json
+from rangecheck.maps import trace_maps
+from rangecheck.pipeline.camera import Optics, camera_of, developed, image_of, optics_of, take
 from rangecheck.pipeline.outcome import Outcome, document
-from rangecheck.pipeline.pictures import before_backdrop, grey_or_colour, plan_of, scene_of
+from rangecheck.pipeline.pictures import plan_of, scene_of
 from rangecheck.pipeline.subject import Subject, read_subject
-from rangecheck.pipeline.views import camera_of, orbit_of, refuse_existing
+from rangecheck.pipeline.views import orbit_of, refuse_existing
 from rangecheck.progress import Reporter
+from rangecheck.raycast import EmbreeCaster
 from rangecheck.reflectance import Material, load_material
+from rangecheck.scene import Scene
 from rangecheck.surface import Surface
-from rangecheck.transport import Plan, Tracer, render
+from rangecheck.transport import Plan, Tracer
+
+Show = Literal["picture", "stripes", "distance", "id"]
 
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """Everything that determines a turntable's frames; it travels to other machines as it is."""
+    """Everything that determines a turntable's frames; it travels to other machines as it is. Maps need no plan."""
 
-    surface: Surface
-    material: Material
-    camera: PinholeCamera
+    scene: Scene
+    show: Show
+    lights: Literal["model", "room"]
+    optics: Optics
     orbit: Orbit
-    plan: Plan
+    plan: Plan | None
     seed: int
 
     def key(self) -> dict[str, Any]:
         """What the frames are known by: the same on every machine, another as soon as anything that shows is another."""
+        light = (
+            {} if self.plan is None else {"plan": (self.plan.settings, self.plan.error, self.plan.grey), "lights": self.lights}
+        )
         return {
             "version": __version__,
-            "vertices": self.surface.vertices,
-            "faces": self.surface.faces,
-            "material": repr(dataclasses.astuple(self.material)),
-            "camera": self.camera.to_dict(),
-            "orbit": repr(self.orbit),
-            "plan": repr(self.plan),
+            "show": self.show,
+            "optics": _plain(dataclasses.replace(self.optics, reasons=())),
+            "orbit": _plain(self.orbit),
+            "surface": (self.scene.surface.vertices, self.scene.surface.faces, self.scene.surface.part_of_face),
+            "scene": {
+                f.name: _plain(getattr(self.scene, f.name))
+                for f in dataclasses.fields(self.scene)
+                if light and f.name != "surface"
+            },
+            "light": _plain(light),
             "seed": self.seed,
         }
 
+    def scale_mm(self) -> tuple[float, float]:
+        """Distances that no frame's map leaves."""
+        away = np.linalg.norm(self.scene.surface.vertices - np.asarray(self.orbit.centre_mm), axis=1).max()
+        return self.orbit.distance_mm - float(away), self.orbit.distance_mm + float(away)
 
-def frames_of(job: Job) -> Callable[[int], FloatArray]:
+
+def _plain(value: Any) -> Any:
+    """Nests of dataclasses as nests of what keys are made of."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {"is": type(value).__name__} | {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, dict):
+        return {name: _plain(item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return value
+
+
+def frames_of(job: Job, tracer: Tracer | None = None) -> Callable[[int], FloatArray]:
     """The function of frame numbers that `job` describes; frame i is the same wherever and whenever it is made."""
-    tracer = Tracer(scene_of(Subject(job.material.name, job.surface), job.material, direct=job.plan.model == "direct"))
+    if job.plan is None:
+        return _maps_of(job)
+    plan = job.plan
+    ready = tracer if tracer is not None else Tracer(job.scene)
+    if plan.grey:
+        ready, plan = ready.grey(), dataclasses.replace(plan, grey=False)
 
     def frame(index: int) -> FloatArray:
-        film = render(tracer, job.camera, job.orbit.world_from_camera(index), plan=job.plan, seed=job.seed + index)
-        return before_backdrop(film)
+        work = ready
+        if job.lights == "room":
+            work = ready.lit_as(ready.scene.lights_moved(job.orbit.world_from_turned(index)))
+        film, _ = take(work, job.optics, job.orbit.world_from_camera(index), plan, job.seed + index)
+        return image_of(film, job.optics)
 
     return frame
+
+
+def _maps_of(job: Job) -> Callable[[int], FloatArray]:
+    surface = job.scene.surface
+    caster = EmbreeCaster(surface.vertices, surface.faces)
+
+    def frame(index: int) -> FloatArray:
+        pose = job.orbit.world_from_camera(index)
+        maps = trace_maps(surface, job.optics.camera, pose, caster, allow_inside=index > 0)
+        return maps.distance_mm if job.show == "distance" else np.where(maps.hit, maps.part_id, np.nan)
+
+    return frame
+
+
+def picture_of(job: Job, image: FloatArray, exposure: float, index: int) -> npt.NDArray[Any]:
+    """What people are shown of a frame."""
+    if job.show == "distance":
+        low, high = job.scale_mm()
+        shown = legend.colours_of(image, low, high)
+        return legend.framed(shown, "Distance from the focal point", scale=legend.ColourScale(low, high, "mm"))
+    if job.show == "id":
+        names = job.scene.surface.part_names
+        colours = np.concatenate([np.array([legend.NOTHING], np.uint8), legend.category_colours(len(names))])
+        words = tuple(f"{k + 1}  {name}" for k, name in enumerate(names))
+        return legend.framed(
+            colours[np.nan_to_num(image).astype(int)], "Surface seen first", scale=legend.Swatches(colours[1:], words)
+        )
+    return developed(image, exposure, job.optics, job.seed, index)
+
+
+def _encoded(job: Job, suffix: str) -> Callable[[FloatArray, float, int], bytes]:
+    def encode(image: FloatArray, exposure: float, index: int) -> bytes:
+        if suffix == ".png":
+            return png_bytes(picture_of(job, image, exposure, index))
+        if job.show == "distance":
+            return exr_bytes({"distance_mm": image})
+        if job.show == "id":
+            return exr_bytes({"part_id": np.nan_to_num(image).astype(np.int64)})
+        return exr_bytes(radiance_channels(image[..., 0] if image.shape[2] == 1 else image))
+
+    return encode
 
 
 @dataclass(frozen=True)
@@ -73,7 +160,7 @@ class Rendered:
 
 
 def render_turntable(
-    surface: Surface,
+    surface: Surface | Subject,
     material_name: str,
     orbit: Orbit,
     film: Path,
@@ -85,35 +172,96 @@ def render_turntable(
     scheduler: str | None = None,
 ) -> Rendered:
     """Frames of the orbit in one material, and their film. Frames that are there already are kept."""
-    material = load_material(material_name)
-    camera = camera_of(settings)
-    with reporter.stage(f"planning light, {material.name}"):
-        tracer = Tracer(scene_of(Subject(material.name, surface), material, direct=settings.light.model == "direct"))
-        plan = plan_of(tracer, camera, orbit.world_from_camera(0), settings)
-    job = Job(surface, material, camera, orbit, plan, settings.seed)
-    with reporter.stage(f"turntable, {material.name}", orbit.frames):
-        frames = _make(job, frames_dir, reporter, force, scheduler)
-    with reporter.stage(f"film, {material.name}"):
-        write_film(frames, film, settings.turntable.fps)
-    return Rendered(material.name, frames, film, plan.explain())
+    made = _frames(surface, material_name, orbit, frames_dir, settings, reporter, force=force, scheduler=scheduler)
+    with reporter.stage(f"film, {made.name}"):
+        write_film(made.pictures(), film, settings.turntable.fps)
+    return Rendered(made.name, made.frames, film, made.plan)
 
 
-def _make(job: Job, folder: Path, reporter: Reporter, force: bool, scheduler: str | None) -> list[Path]:
+@dataclass(frozen=True)
+class _Made:
+    """Finished frames of one material."""
+
+    name: str
+    job: Job
+    frames: list[Path]
+    plan: list[str]
+
+    def pictures(self) -> Iterator[npt.NDArray[np.uint8]]:
+        """Every frame as people are shown it."""
+        exposure = 0.0
+        for index, path in enumerate(self.frames):
+            if path.suffix == ".png":
+                yield read_png(path)
+                continue
+            exposure = exposure or float(read_json(path.with_name(MANIFEST))["exposure"])
+            channels = read_exr(path)
+            if self.job.show == "id":
+                image = np.where(channels["part_id"] > 0, channels["part_id"], np.nan)
+            elif len(channels) == 1:
+                image = next(iter(channels.values()))[..., None] if self.job.plan else next(iter(channels.values()))
+            else:
+                image = np.stack([channels[name] for name in "RGB"], axis=-1)
+            yield picture_of(self.job, image, exposure, index)
+
+
+def _frames(
+    subject: Surface | Subject,
+    material_name: str,
+    orbit: Orbit,
+    folder: Path,
+    settings: Settings,
+    reporter: Reporter,
+    *,
+    force: bool,
+    scheduler: str | None,
+) -> _Made:
+    known = subject if isinstance(subject, Subject) else Subject(material_name, subject)
+    material, show = load_material(material_name), settings.turntable.show
+    optics = optics_of(settings, camera_of(settings), orbit.distance_mm)
+    if optics.sensor is not None and optics.sensor.bits > 8:
+        raise SettingError(f"sensor.bits is {optics.sensor.bits}; films and their frames have 8", key="sensor.bits")
+    scene = scene_of(known, material, direct=settings.light.model == "direct", stripes=show == "stripes")
+    what = show if show in ("distance", "id") else material.name
+    tracer, plan, said = None, None, list(optics.reasons)
+    if show in ("picture", "stripes"):
+        with reporter.stage(f"planning light, {material.name}"):
+            tracer = Tracer(scene)
+            plan = plan_of(tracer, optics.camera, orbit.world_from_camera(0), settings)
+            said = [*plan.explain(), *said]
+            if optics.lens is not None:
+                said.append(
+                    f"defocus: traced where circles of confusion exceed half a pixel, focused at {optics.lens.focus_mm:.4g} mm"
+                )
+    job = Job(scene, show, settings.turntable.lights, optics, orbit, plan, settings.seed)
+    with reporter.stage(f"turntable, {what}", orbit.frames):
+        frames = _make(job, folder, reporter, force, scheduler, f".{settings.turntable.frame_format}", tracer)
+        poses = [orbit.world_from_camera(i) for i in range(orbit.frames)]
+        names = [path.name for path in frames]
+        write_camera_list(folder / "cameras.json", optics.asked, poses, names, optics.to_dict())
+        write_colmap(folder / "colmap", [optics.asked] * len(poses), poses, names)
+    return _Made(what, job, frames, said)
+
+
+def _make(
+    job: Job, folder: Path, reporter: Reporter, force: bool, scheduler: str | None, suffix: str, tracer: Tracer | None
+) -> list[Path]:
     def made(frame: Callable[[int], FloatArray], spread: Any = None) -> list[Path]:
         return render_frames(
             frame,
             job.orbit.frames,
             folder,
             job.key(),
-            encode=_encode,
-            exposure=exposure_from,
+            encode=_encoded(job, suffix),
+            exposure=1.0 if job.plan is None else exposure_of,
+            suffix=suffix,
             force=force,
             progress=lambda done, _: reporter.advance(done),
             spread=spread,
         )
 
     if scheduler is None:
-        return made(frames_of(job))
+        return made(frames_of(job, tracer))
     from rangecheck.animation.farm import Farm
 
     with Farm(scheduler) as farm:
@@ -121,12 +269,13 @@ def _make(job: Job, folder: Path, reporter: Reporter, force: bool, scheduler: st
         return made(_nowhere, farm.spread(frames_of, job, job.key()))
 
 
+def exposure_of(images: Sequence[FloatArray]) -> float:
+    """One exposure for images (h, w, c) of one or three wavelengths."""
+    return exposure_from([image[..., 0] if image.shape[2] == 1 else image for image in images])
+
+
 def _nowhere(index: int) -> FloatArray:
     raise AssertionError(f"frame {index} was to be made on the cluster")
-
-
-def _encode(radiance: FloatArray, exposure: float) -> bytes:
-    return png_bytes(develop(grey_or_colour(radiance), exposure))
 
 
 def turntable(
@@ -136,31 +285,76 @@ def turntable(
     settings: Settings,
     unit: str | None,
     frames_dir: str | None,
+    materials: Sequence[str] = (),
+    sheet: str | None = None,
     scheduler: str | None = None,
     force: bool,
     reporter: Reporter,
 ) -> Outcome:
-    """Frames and film of one turn around what is in `path`, in the first material of the settings."""
+    """Frames and film of one turn around what is in `path`: in one material, or in several, side by side.
+
+    Without `materials` it is the first of the settings, for stripes the first that mirrors. `sheet` is a picture of all frames."""
     film = Path(out)
     if film.suffix.lower() not in FORMATS:
         raise OutputError(out, f"must end in one of {', '.join(FORMATS)}")
-    refuse_existing(out, force)
+    if sheet is not None and Path(sheet).suffix.lower() != ".png":
+        raise OutputError(sheet, "must end in .png")
+    for target in (out, *([sheet] if sheet else [])):
+        refuse_existing(target, force)
     find_encoder(film.suffix.lower())
+    if settings.turntable.frame_format == "exr":
+        need_openexr()
+    chosen = tuple(materials) or _chosen(settings)
+    if settings.turntable.show in ("distance", "id"):
+        chosen = chosen[:1]
+    elif settings.turntable.show == "stripes":
+        for name in chosen:
+            _need_mirror(load_material(name))
     subject = read_subject(path, settings, unit, reporter)
+    orbit = orbit_of(subject.surface, settings)
     folder = Path(frames_dir) if frames_dir else film.with_name(f"{film.stem}-frames")
-    made = render_turntable(
-        subject.surface,
-        settings.light.materials[0],
-        orbit_of(subject.surface, settings),
-        film,
-        folder,
-        settings,
-        reporter,
-        force=force,
-        scheduler=scheduler,
-    )
-    lines = [f"{out}: {len(made.frames)} frames in {made.material}", f"frames are kept in {folder}", *made.plan]
+    made = [
+        _frames(subject, name, orbit, folder if len(chosen) == 1 else folder / Path(name).stem, settings, reporter, force=force, scheduler=scheduler)
+        for name in chosen
+    ]  # fmt: skip
+    with reporter.stage("film"):
+        write_film(_side_by_side(made), film, settings.turntable.fps)
+        if sheet is not None:
+            numbers = [f"{360 * i / orbit.frames:.0f}°" for i in range(orbit.frames)]
+            write_png(sheet, contact_sheet(list(_side_by_side(made)), numbers))
+    names = " | ".join(m.name for m in made)
+    lines = [f"{out}: {orbit.frames} frames in {names}", f"frames are kept in {folder}"]
+    lines += list(dict.fromkeys(line for m in made for line in m.plan))
     return Outcome(
-        document("turntable", output=out, frames=made.frames, material=made.material, plan=made.plan, seconds=reporter.seconds),
+        document("turntable", output=out, frames=[path for m in made for path in m.frames], material=names, show=settings.turntable.show,
+                 sheet=sheet, plan=[line for m in made for line in m.plan], seconds=reporter.seconds),
         lines,
-    )
+    )  # fmt: skip
+
+
+def _side_by_side(made: Sequence[_Made]) -> Iterator[npt.NDArray[np.uint8]]:
+    """One picture after the other; those of several materials beside each other."""
+    for pictures in zip(*(m.pictures() for m in made), strict=True):
+        if len(pictures) == 1:
+            yield pictures[0]
+        else:
+            coloured = [p if p.ndim == 3 else np.repeat(p[..., None], 3, axis=2) for p in pictures]
+            yield np.concatenate(coloured, axis=1)
+
+
+def _chosen(settings: Settings) -> tuple[str, ...]:
+    names = settings.light.materials
+    if settings.turntable.show == "stripes":
+        return next(((name,) for name in names if _mirrors(load_material(name))), names[:1])
+    return names[:1]
+
+
+def _mirrors(material: Material) -> bool:
+    return bool(material.strengths()[1:].any())
+
+
+def _need_mirror(material: Material) -> None:
+    if not _mirrors(material):
+        raise SettingError(
+            f"{material.name} mirrors nothing, and stripes are seen in mirrors; choose steel", key="light.materials"
+        )

@@ -14,6 +14,7 @@ from rangecheck.export.camera_files import write_camera_json
 from rangecheck.export.map_files import write_chain, write_maps, write_shadows
 from rangecheck.maps import Maps, back_projection_error, require_outside, trace_chain, trace_maps, trace_shadows
 from rangecheck.optics import PinholeCamera
+from rangecheck.pipeline.camera import camera_of
 from rangecheck.pipeline.folder import check_free, check_writable
 from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.subject import Subject, read_subject
@@ -23,16 +24,18 @@ from rangecheck.rigid import look_at
 from rangecheck.surface import Surface
 
 
-def camera_of(settings: Settings) -> PinholeCamera:
-    """The pinhole camera of the settings."""
-    picture = settings.picture
-    return PinholeCamera.from_field_of_view(picture.width, picture.height, picture.field_of_view_deg)
-
-
 def orbit_of(surface: Surface, settings: Settings) -> Orbit:
     """The tightest orbit whose every frame holds the whole surface."""
     turn = settings.turntable
-    return orbit_around(surface, camera_of(settings), frames=turn.frames, elevation_deg=turn.elevation_deg, margin=turn.margin)
+    return orbit_around(
+        surface,
+        camera_of(settings),
+        frames=turn.frames,
+        elevation_deg=turn.elevation_deg,
+        margin=turn.margin,
+        start_deg=turn.start_deg,
+        swing_deg=turn.swing_deg,
+    )
 
 
 def view_of(subject: Subject, settings: Settings, camera_mm: tuple[float, ...] | None) -> tuple[PinholeCamera, FloatArray]:
