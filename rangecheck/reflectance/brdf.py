@@ -77,7 +77,8 @@ def lobe_brdf(
     # a single value serves all without being spread
     flat = [(a if np.size(a) == 1 or np.shape(a) == shape else np.broadcast_to(a, shape).copy()).reshape(-1) for a in given]
     masks = masking_number != UNMASKED or bounded
-    surface, seen = _visibilities(*np.broadcast_arrays(flat[3], flat[4]), masking_number, bounded)
+    roughness, reach = np.broadcast_arrays(flat[3], flat[4])
+    surface, seen = _visibilities(roughness, reach, masking_number, bounded)
     out = np.empty(shape).reshape(-1)
     if form_number == FAST:
         kept = [np.empty(out.size if masks else 0) for _ in range(3)]

@@ -26,9 +26,10 @@ from rangecheck.files import presets_folder, read_bytes
 from rangecheck.reflectance.energy import visibility_table
 from rangecheck.reflectance.fast import lobe_table
 from rangecheck.reflectance.fresnel import fresnel_table
-from rangecheck.reflectance.lobe import MASKINGS, two_numbers
+from rangecheck.reflectance.lobe import FAST, MASKINGS, two_numbers
 from rangecheck.reflectance.tables import (
     CORRELATION_UM,
+    FORM,
     FRESNEL,
     K_LM,
     K_LOBE,
@@ -198,6 +199,7 @@ def stack_tables(materials: Sequence[Material]) -> MaterialTables:
             row[K_LM], row[K_SPIKE], row[K_LOBE] = k_lm[w], k_ss[w] + k_s[w], lobe
             row[ROUGHNESS], row[REACH], row[MASKING] = roughness, reach, masking
             row[SIGMA_UM], row[CORRELATION_UM], row[WAVELENGTH_UM] = material.sigma_um, material.correlation_um, wavelength
+            row[FORM] = FAST
             row[VISIBILITY:FRESNEL] = visibility_table(roughness, reach, masking, material.bounded and lobe > 0.0)
             row[FRESNEL:] = _fresnel_table(*material.index_at(wavelength))
     surfaces.flags.writeable = False

@@ -24,11 +24,12 @@ from rangecheck.kernels import inline_kernel
 from rangecheck.reflectance.energy import VISIBILITY_OCTAVES
 from rangecheck.reflectance.fast import lobe_fast
 from rangecheck.reflectance.fresnel import FRESNEL_OCTAVES
-from rangecheck.reflectance.lobe import V_GROOVE, lobe_geometry, spike_share, v_groove_masking
+from rangecheck.reflectance.lobe import ROUGH, SMOOTH, V_GROOVE, lobe_geometry, spike_share, v_groove_masking
 from rangecheck.reflectance.octaves import node_count, value_at
+from rangecheck.reflectance.series import lobe_rough, lobe_smooth
 
 #: what the last axis of `surfaces` begins with; the tables of visibility and of Fresnel's share follow
-K_LM, K_SPIKE, K_LOBE, ROUGHNESS, REACH, MASKING, SIGMA_UM, CORRELATION_UM, WAVELENGTH_UM = range(9)
+K_LM, K_SPIKE, K_LOBE, ROUGHNESS, REACH, MASKING, SIGMA_UM, CORRELATION_UM, WAVELENGTH_UM, FORM = range(10)
 VISIBILITY = 16
 FRESNEL = VISIBILITY + node_count(VISIBILITY_OCTAVES)
 SURFACE_LENGTH = FRESNEL + node_count(FRESNEL_OCTAVES)
@@ -38,7 +39,7 @@ class MaterialTables(NamedTuple):
     """All that a tracer needs of its materials, m of them at w wavelengths; float64, C-contiguous, read-only.
 
     surfaces  (m, w, SURFACE_LENGTH) strengths K_LM, K_SPIKE, K_LOBE in 0..1; roughness and reach as in lobe.py; the masking's
-              number; lengths; from VISIBILITY on s(theta) times Smith's masking, from FRESNEL on F against cos^2
+              number; lengths; the number of the lobe's FORM; from VISIBILITY on s(theta) times Smith's masking, from FRESNEL on F against cos^2
     series    the one table of S(g, a), the same for all
     """
 
@@ -57,7 +58,13 @@ def lobe_value(surfaces, series, material, wave, c_i, c_r, sxy2):
     value *= seen * value_at(surfaces, material, wave, FRESNEL, 0.25 * (u2 + sxy2), FRESNEL_OCTAVES)
     if surfaces[material, wave, MASKING] == V_GROOVE:
         value *= v_groove_masking(c_i, c_r, sxy2)
-    return value * lobe_fast(series, surfaces[material, wave, ROUGHNESS] * u2, reach * sxy2)
+    g, a = surfaces[material, wave, ROUGHNESS] * u2, reach * sxy2
+    form = surfaces[material, wave, FORM]
+    if form == SMOOTH:
+        return value * lobe_smooth(g, a)
+    if form == ROUGH:
+        return value * lobe_rough(g, a)
+    return value * lobe_fast(series, g, a)
 
 
 @inline_kernel

@@ -145,7 +145,7 @@ def _whole(evaluations: int, rounds: int) -> tuple[SpeedChart, list[dict[str, An
     angles = (theta_i, theta_r, rng.normal(0.0, 0.2, evaluations))
     candidates, errors = [], {}
     for sigma, correlation in ((0.02, 3.0), (0.1, 3.0), (1.0, 10.0)):
-        surface = {"sigma_um": sigma, "correlation_um": correlation, "wavelength_um": GREEN_UM}
+        surface: dict[str, Any] = {"sigma_um": sigma, "correlation_um": correlation, "wavelength_um": GREEN_UM}
         exact = lobe_brdf(*angles, form="series", **surface)
         seen = exact > math.exp(-30.0) * exact.max()
         for form in ("fast", "series"):

@@ -9,6 +9,7 @@ of the two differences is free of their noise. Twice its standard error is added
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -16,11 +17,13 @@ import numpy as np
 from rangecheck.arrays import FloatArray, IntArray
 from rangecheck.errors import SettingError
 from rangecheck.optics import Camera
+from rangecheck.reflectance import MaterialTables
 from rangecheck.reflectance.fast import FAST_ERROR
+from rangecheck.reflectance.forms import form_error, with_forms
 from rangecheck.scene import Scene
 from rangecheck.transport.adaptive import render_to
 from rangecheck.transport.camera_rays import PictureRays, pixel_order
-from rangecheck.transport.film import Film
+from rangecheck.transport.film import Film, Plate
 from rangecheck.transport.settings import REPORT, Settings
 from rangecheck.transport.tracer import Tracer
 
@@ -33,8 +36,12 @@ _EACH_SHARE, _ALL_SHARE = 0.2, 0.5
 #: the estimate of the remaining noise is asked to stay this far below what is left
 _NOISE_SHARE = 0.8
 _PILOT_PIXELS, _PILOT_PASSES = 2048, 8
+#: a form that may be off by more than this share of the peak is not tried
+_FORM_WORTH_A_TRY = 0.1
 _DEPTHS = (1, 2, 3, 4, 6, 10, 16)
 _FULL_DEPTH = 64
+#: observations of a pixel that `full` takes in one go
+_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
@@ -44,6 +51,7 @@ class Plan:
     settings  the light that is followed
     error     what the noise of the picture may be, relative to its mean radiance; None: settings.passes says how many samples
     grey      computed at one wavelength, and given to all
+    forms     of the lobe, material by material: fast, or the cheaper smooth or rough; empty: all fast
     reasons   one line per decision
     """
 
@@ -52,6 +60,7 @@ class Plan:
     settings: Settings
     error: float | None
     grey: bool = False
+    forms: tuple[str, ...] = ()
     reasons: tuple[str, ...] = field(default=(), repr=False)
 
     def explain(self) -> list[str]:
@@ -100,7 +109,7 @@ def render(
 ) -> Film:
     """The picture by its plan (made here unless given). Same bytes on any number of threads."""
     plan = plan or make_plan(tracer, camera, world_from_camera, tolerance=tolerance, seed=seed)
-    work = tracer.grey() if plan.grey else tracer
+    work = _formed(tracer.grey() if plan.grey else tracer, plan.forms)
     if plan.error is None:
         film = work.render(camera, world_from_camera, plan.settings, seed=seed)
     elif plan.model == "full":
@@ -121,16 +130,33 @@ def render_evenly(
     most: int = 1 << 18,
 ) -> Film:
     """The same number of samples in every pixel, as many as bring the frame's standard error to `error` of its mean."""
-    passes = 4
+    picture, pixels = tracer.picture_rays(camera, world_from_camera), pixel_order(camera.width, camera.height)
+    plate = Plate(camera.height, camera.width, tracer.scene.channels)
+    tally = np.zeros(())
+    done, passes = 0, 4
     while True:
-        film = tracer.render(camera, world_from_camera, replace(settings, passes=passes), seed=seed)
+        while done < passes:
+            step = min(_AT_ONCE, passes - done)
+            tally = tally + tracer.expose(picture, pixels, settings, seed, plate, done, step)
+            done += step
+        film = plate.develop(tally / (passes * len(pixels)), tracer.lights, plate.count * np.int32(settings.each))
         mean = film.mean_radiance
         if not mean > 0 or passes * settings.each >= most:
             return film
         ratio = film.standard_error() / (error * mean)
         if ratio <= 1:
             return film
-        passes = min(max(2 * passes, math.ceil(passes * min(ratio * ratio, 16.0))), max(1, most // settings.each))
+        passes = min(max(passes + 1, math.ceil(passes * min(ratio * ratio, 4.0))), max(1, most // settings.each))
+
+
+def _formed(tracer: Tracer, forms: tuple[str, ...]) -> Tracer:
+    """The same scene, its lobes evaluated by these forms."""
+    if not forms or set(forms) == {"fast"}:
+        return tracer
+    twin = copy(tracer)
+    tables = with_forms(MaterialTables(tracer.materials.surfaces, tracer.materials.series), forms)
+    twin.materials = tracer.materials._replace(surfaces=tables.surfaces)
+    return twin
 
 
 _REPORT_REASONS = (
@@ -153,6 +179,7 @@ class _Planner:
         chosen = order[: blocks * 16].reshape(blocks, 16)[places.astype(int)] if wanted else order
         self.pixels: IntArray = np.ascontiguousarray(chosen.ravel())
         self.reasons: list[str] = []
+        self.forms: tuple[str, ...] = ("fast",) * len(tracer.scene.materials)
         self.spent = 0.0
         self.settings = full_settings(tracer)
         self.seen: tuple[FloatArray, FloatArray] = self._look(self.settings)
@@ -167,20 +194,22 @@ class _Planner:
         self._reflections()
         self._depth()
         self._branches()
-        self._lobe_form()
+        self._lobe_forms()
         grey = self._grey()
         left = math.sqrt(self.tolerance**2 - self.spent**2)
         error = _NOISE_SHARE * left
         self.reasons.append(
             f"samples: one through each pixel's middle, more at edges, highlights, penumbrae and noise until the estimated error is {_percent(error)}"
         )
-        return Plan("plan", self.tolerance, self.settings, error, grey, tuple(self.reasons))
+        return Plan("plan", self.tolerance, self.settings, error, grey, self.forms, tuple(self.reasons))
 
     def _look(self, settings: Settings) -> tuple[FloatArray, FloatArray]:
         """(n, c) radiance of the pilot's pixels, twice, with independent chance."""
         settings = replace(settings, passes=_PILOT_PASSES, each=1, centre=False)
         first, second = (
-            self.tracer.probe(self.picture, self.pixels, settings, self.seed + 0x5EED + k).mean(axis=0, dtype=np.float64)
+            _formed(self.tracer, self.forms)
+            .probe(self.picture, self.pixels, settings, self.seed + 0x5EED + k)
+            .mean(axis=0, dtype=np.float64)
             for k in (0, 1)
         )
         return first, second
@@ -188,17 +217,23 @@ class _Planner:
     def _cost(self, without: Settings) -> tuple[float, tuple[FloatArray, FloatArray]]:
         """Relative error of these settings against the present ones, and what they see."""
         seen = self._look(without)
-        first, second = seen[0] - self.seen[0], seen[1] - self.seen[1]
+        return self._relative(seen[0] - self.seen[0], seen[1] - self.seen[1]), seen
+
+    def _relative(self, first: FloatArray, second: FloatArray) -> float:
+        """Root mean square of a difference that was measured twice, with two standard errors, relative to the mean radiance."""
         product = (first * second).mean(axis=1)
         squared = float(product.mean()) + 2.0 * float(product.std()) / math.sqrt(len(product))
         # light so rare that the two never meet still shows in the mean
         mean = 0.5 * float(first.mean() + second.mean())
-        return math.sqrt(max(squared, mean * mean)) / self.mean, seen
+        return math.sqrt(max(squared, mean * mean)) / self.mean
+
+    def _allowed(self) -> float:
+        return min(_EACH_SHARE * self.tolerance, _ALL_SHARE * self.tolerance - self.spent)
 
     def _try(self, name: str, without: Settings, said: str) -> bool:
         """Take `without` if it costs little enough."""
         cost, seen = self._cost(without)
-        allowed = min(_EACH_SHARE * self.tolerance, _ALL_SHARE * self.tolerance - self.spent)
+        allowed = self._allowed()
         if cost <= allowed:
             self.settings, self.seen = without, seen
             self.spent += cost
@@ -249,7 +284,7 @@ class _Planner:
             return
         for depth in _DEPTHS:
             cost, seen = self._cost(replace(self.settings, depth=depth))
-            allowed = min(_EACH_SHARE * self.tolerance, _ALL_SHARE * self.tolerance - self.spent)
+            allowed = self._allowed()
             if cost <= allowed:
                 self.settings, self.seen = replace(self.settings, depth=depth), seen
                 self.spent += cost
@@ -279,21 +314,54 @@ class _Planner:
             f"gathering rays: {rays} at the surface seen, one further on; {100 * gathered / max(one, 1e-300):.0f} % of a sample's variance comes from gathering"
         )
 
-    def _lobe_form(self) -> None:
-        if any(m.strengths()[1:].any() for m in self.tracer.scene.materials):
-            kind = "at the middle of each source" if self.settings.shadow_rays == 0 else "over each source's solid angle"
-            self.reasons.append(f"lobe: the fast form, within {_percent(FAST_ERROR)} of the series, {kind}")
+    def _lobe_forms(self) -> None:
+        """Each material's lobe by the cheapest form: smooth or rough cost half of the table, where the pilot finds no difference that counts."""
+        kind = "at the middle of each source" if self.settings.shadow_rays == 0 else "over each source's solid angle"
+        for index, material in enumerate(self.tracer.scene.materials):
+            name = f"lobe of {material.name}"
+            if not material.strengths()[2:].any() or not material.sigma_um > 0.0:
+                continue
+            bounds = {form: form_error(form, material) for form in ("smooth", "rough")}
+            form = min(bounds, key=lambda f: bounds[f])
+            said = f"the {form} form is off by {_percent(bounds[form])} of the lobe's peak at most"
+            if bounds[form] > _FORM_WORTH_A_TRY:
+                self.reasons.append(f"{name}: the fast form, within {_percent(FAST_ERROR)} of the series, {kind}; {said}")
+                continue
+            before = self.forms
+            self.forms = (*before[:index], form, *before[index + 1 :])
+            cost, seen = self._cost(self.settings)
+            allowed = self._allowed()
+            if cost <= allowed:
+                self.seen, self.spent = seen, self.spent + cost
+                self.reasons.append(
+                    f"{name}: the {form} form, {kind}; {said}, which the pilot finds to change the picture by {_percent(cost)}, "
+                    f"{_percent(allowed)} was allowed"
+                )
+            else:
+                self.forms = before
+                self.reasons.append(
+                    f"{name}: the fast form, within {_percent(FAST_ERROR)} of the series, {kind}; {said}, which the pilot finds to change the "
+                    f"picture by {_percent(cost)}, {_percent(allowed)} was allowed"
+                )
 
     def _grey(self) -> bool:
-        if self.tracer.scene.channels == 1:
+        channels = self.tracer.scene.channels
+        if channels == 1:
+            self.reasons.append("colour: the scene has one wavelength")
             return False
         if _is_grey(self.tracer.scene):
             self.reasons.append("colour: one wavelength; no material and no light tells wavelengths apart")
             return True
-        spread = [half - half.mean(axis=1, keepdims=True) for half in self.seen]
-        product = (spread[0] * spread[1]).mean(axis=1)
-        cost = math.sqrt(max(float(product.mean()) + 2.0 * float(product.std()) / math.sqrt(len(product)), 0.0)) / self.mean
-        self.reasons.append(f"colour: {self.tracer.scene.channels} wavelengths; one would be off by {_percent(cost)}")
+        # against the wavelength that a grey picture would be made of
+        first, second = (half - half[:, channels // 2][:, None] for half in self.seen)
+        cost, allowed = self._relative(first, second), self._allowed()
+        if cost <= allowed:
+            self.spent += cost
+            self.reasons.append(f"colour: one wavelength; the others differ by {_percent(cost)}, {_percent(allowed)} was allowed")
+            return True
+        self.reasons.append(
+            f"colour: {channels} wavelengths; one would be off by {_percent(cost)}, {_percent(allowed)} was allowed"
+        )
         return False
 
 
