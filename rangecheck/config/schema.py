@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
 Degrees = Annotated[float, Field(ge=-90, le=90, allow_inf_nan=False)]
 
 
@@ -62,13 +63,42 @@ class Meshing(Section):
 class Solidify(Section):
     """From a surface to a part that can be built."""
 
+    close: Literal["auto", "repair", "relief"] = Field(
+        "auto",
+        description="repair fills holes and mends defects; relief gives what was seen from one side a back; auto chooses and says why",
+    )
     relief_depth_mm: Positive = Field(
         20.0, description="how far behind its deepest point a relief from one view gets its back plane"
     )
-    base: Literal["auto", "none"] = Field("auto", description="auto cuts the bust flat where its lower end is ragged or invented")
+    relief_back: Literal["plane", "hollow"] = Field("plane", description="hollow opens the back of a relief to a wall of wall_mm")
+    max_move_mm: Positive = Field(
+        0.05, description="how far repair may move any point of the surface; what needs more is refused"
+    )
+    max_vanished_percent: Annotated[float, Field(ge=0, le=100)] = Field(
+        1.0, description="share of the area that repair may take away"
+    )
+    longest_hole_mm: Positive | None = Field(
+        None, description="longest rim of a hole that repair fills; without it, all are filled"
+    )
+    cut: tuple[Finite, Finite, Finite, Finite] | None = Field(
+        None, description="nx, ny, nz, d: a plane cut with a cap; what lies on the side of the normal, n . x > d, is kept"
+    )
+    base: Literal["auto", "none", "socle"] = Field(
+        "auto", description="auto cuts the bust flat where its lower end is ragged or invented; socle puts a plinth under that"
+    )
     base_height_mm: float | None = Field(None, description="height of the base plane above the lowest point; overrides auto")
-    max_move_mm: Positive = Field(0.2, description="how far repair may move any point of the surface; what needs more is refused")
+    nameplate: str = Field("", description="text on a plate at the front of the socle")
     height_mm: Positive | None = Field(None, description="scale the finished part to this height")
+    simplify_mm: Positive | Literal["auto"] | None = Field(
+        None,
+        description="largest distance that fewer triangles may lie off; auto takes a quarter of the printer's pixel or layer",
+    )
+    wall_mm: Positive | None = Field(None, description="hollow the part to a wall of this thickness")
+    drain_mm: Annotated[float, Field(ge=0, allow_inf_nan=False)] = Field(4.0, description="diameter of drains; 0 drills none")
+    print_up: tuple[Finite, Finite, Finite] = Field(
+        (0.0, 1.0, 0.0), description="away from the build plate: the tilt for which it must drain"
+    )
+    printer: str | None = Field(None, description="a profile of configs/printers, or a profile file, that the part is judged for")
 
 
 class Picture(Section):

@@ -11,13 +11,14 @@ import io
 import json
 import struct
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rangecheck.errors import OutputError
-from rangecheck.export.stl import as_float32, proved_file, write_stl
+from rangecheck.export.stl import Exported, as_float32, proved_file, write_stl
 from rangecheck.files import whole_file
 from rangecheck.solid.rounding import collapse_flat_faces
 from rangecheck.solid.solid import Solid
@@ -28,25 +29,40 @@ SUFFIXES = (".ply", ".obj", ".off", ".glb", ".3mf", ".stl")
 ORIGIN_COLOURS = ((0.75, 0.75, 0.75), (0.35, 0.55, 0.85), (0.85, 0.4, 0.25))
 
 
-def write_mesh(surface: Surface | Solid, path: str | Path, *, force: bool = True) -> None:
-    """Write a surface in mm to `path`, in the format of its ending, whole or not at all; same surface, same bytes.
+def write_mesh(
+    surface: Surface | Solid,
+    path: str | Path,
+    *,
+    force: bool = True,
+    force_open: bool = False,
+    ascii: bool = False,
+    severities: Mapping[str, str] | None = None,
+) -> Exported | None:
+    """Write a surface in mm to `path`, in the format of its ending, whole or not at all; same surface, same bytes. What was read back of an
+    STL or of a Solid is returned. `ascii` and `force_open` concern STL (see `write_stl`).
 
     Raises OutputError for an unknown ending, NotSolid for an STL of what is not a Solid and for a Solid that its file no longer says."""
     suffix = Path(path).suffix.lower()
     if suffix == ".stl":
-        write_stl(surface, path, force=force)
-        return
+        return write_stl(surface, path, force=force, force_open=force_open, ascii=ascii, severities=severities)
     proved = isinstance(surface, Solid)
     shape = surface.surface if isinstance(surface, Solid) else surface
+    moved = 0.0
     if proved and suffix == ".glb":
         # GLB holds float32 like STL
-        shape = collapse_flat_faces(as_float32(shape)[0])
+        shape, moved = as_float32(shape)
+        shape = collapse_flat_faces(shape)
     try:
         content = {".ply": _ply, ".obj": _obj, ".off": _off, ".glb": _glb, ".3mf": _3mf}[suffix](shape)
     except KeyError:
         raise OutputError(path, f"ends in {suffix or 'nothing'}; a mesh ends in {', '.join(SUFFIXES)}") from None
-    with proved_file(path, force=force, must_be_solid=True) if proved else whole_file(path, force=force) as part:
-        (part[0] if isinstance(part, tuple) else part).write_bytes(content)
+    if not proved:
+        with whole_file(path, force=force) as part:
+            part.write_bytes(content)
+        return None
+    with proved_file(path, force=force, must_be_solid=True, severities=severities) as (part, judged):
+        part.write_bytes(content)
+    return Exported(Path(path), len(shape.faces), judged.verdict, moved, judged.surface)
 
 
 def _ply(surface: Surface) -> bytes:

@@ -4,14 +4,15 @@ STL holds float32 corners without indices. At 300 mm float32 steps by 3e-5 mm, s
 rounded. Therefore the check is part of the export: the coordinates are rounded first, faces that lose their area are collapsed, the
 bytes are read back as a slicer would, welded where equal, and judged again. Only a `Solid` is exported.
 
-Binary: 80 bytes of header, a little-endian count, then per face normal, three corners, two bytes. Same solid, same bytes.
+Binary: 80 bytes of header, a little-endian count, then per face normal, three corners, two bytes. ASCII: nine digits, which say every
+float32 exactly. Same solid, same bytes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -31,44 +32,72 @@ _HEADER = b"binary STL, millimetres, written by rangecheck"
 
 @dataclass(frozen=True)
 class Exported:
-    """What was written: the file, its faces, the check of its own bytes, and the farthest that rounding moved a vertex."""
+    """What was written: the file, its faces, the check of its own bytes, the farthest that rounding moved a vertex, and what was read back."""
 
     path: Path
     faces: int
     verdict: Verdict
     moved_mm: float
+    read_back: Surface = field(repr=False)
 
 
-def write_stl(solid: Solid | Surface, path: str | Path, *, force: bool = True, force_open: bool = False) -> Exported:
-    """Write binary STL in mm, whole or not at all, and check what the file says.
+def write_stl(
+    solid: Solid | Surface,
+    path: str | Path,
+    *,
+    force: bool = True,
+    force_open: bool = False,
+    ascii: bool = False,
+    severities: Mapping[str, str] | None = None,
+) -> Exported:
+    """Write STL in mm, binary unless `ascii`, whole or not at all, and check what the file says.
 
     A Surface that is no Solid is refused with NotSolid unless `force_open`; then the verdict on its bytes is returned, not raised.
-    Raises OutputError when the file cannot be written or exists and `force` is False."""
+    `severities` overrides those of findings by code. Raises OutputError when the file cannot be written or exists and `force` is False."""
     surface = solid.surface if isinstance(solid, Solid) else solid
     if not isinstance(solid, Solid) and not force_open:
         raise NotSolid("only a Solid is exported as STL; make one with Solid.from_surface(), or force an open file", findings=())
     rounded, moved = as_float32(surface)
     if isinstance(solid, Solid):
         rounded = collapse_flat_faces(rounded)
-    with proved_file(path, force=force, must_be_solid=not force_open) as (part, judged), part.open("wb") as stream:
-        stream.write(_HEADER.ljust(80, b" ") + np.uint32(len(rounded.faces)).astype("<u4").tobytes())
+    with (
+        proved_file(path, force=force, must_be_solid=not force_open, severities=severities) as (part, judged),
+        part.open("wb") as stream,
+    ):
+        if not ascii:
+            stream.write(_HEADER.ljust(80, b" ") + np.uint32(len(rounded.faces)).astype("<u4").tobytes())
+        else:
+            stream.write(b"solid rangecheck millimetres\n")
         for start in range(0, len(rounded.faces), 1 << 18):
-            stream.write(_records(rounded, slice(start, start + (1 << 18))).tobytes())
-    return Exported(Path(path), len(rounded.faces), judged[0], moved)
+            records = _records(rounded, slice(start, start + (1 << 18)))
+            stream.write(_facets(records) if ascii else records.tobytes())
+        if ascii:
+            stream.write(b"endsolid rangecheck\n")
+    return Exported(Path(path), len(rounded.faces), judged.verdict, moved, judged.surface)
+
+
+@dataclass
+class ReadBack:
+    """What a written file says, filled in once it was read."""
+
+    verdict: Verdict = field(init=False)
+    surface: Surface = field(init=False)
 
 
 @contextmanager
-def proved_file(path: str | Path, *, force: bool, must_be_solid: bool) -> Iterator[tuple[Path, list[Verdict]]]:
-    """A file to be written in the block; it gets its name only after its bytes were read back and judged (the verdict is appended to
-    the list). Raises NotSolid when they are not solid although `must_be_solid`."""
-    judged: list[Verdict] = []
+def proved_file(
+    path: str | Path, *, force: bool, must_be_solid: bool, severities: Mapping[str, str] | None = None
+) -> Iterator[tuple[Path, ReadBack]]:
+    """A file to be written in the block; it gets its name only after its bytes were read back and judged, which fills in the ReadBack.
+    Raises NotSolid when they are not solid although `must_be_solid`."""
+    judged = ReadBack()
     with whole_file(path, force=force) as part:
         yield part, judged
         # GLB and 3MF say their unit themselves
-        verdict = check_solid(open_mesh(part, None if part.suffix.lower() in (".glb", ".3mf") else "mm").surface)
+        judged.surface = open_mesh(part, None if part.suffix.lower() in (".glb", ".3mf") else "mm").surface
+        verdict = judged.verdict = check_solid(judged.surface, severities=severities)
         if must_be_solid and not verdict.fit:
             raise NotSolid(f"{path}: read back as float32 it is {verdict.sentence()}", findings=verdict.findings, verdict=verdict)
-        judged.append(verdict)
 
 
 def as_float32(surface: Surface) -> tuple[Surface, float]:
@@ -91,3 +120,12 @@ def _records(surface: Surface, faces: slice) -> npt.NDArray[np.void]:
     records["corners"] = corners
     records["normal"] = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
     return records
+
+
+def _facets(records: npt.NDArray[np.void]) -> bytes:
+    numbers = np.concatenate([records["normal"], records["corners"].reshape(-1, 9)], axis=1).tolist()
+    shape = (
+        "facet normal {:.9g} {:.9g} {:.9g}\n outer loop\n  vertex {:.9g} {:.9g} {:.9g}\n  vertex {:.9g} {:.9g} {:.9g}\n"
+        "  vertex {:.9g} {:.9g} {:.9g}\n endloop\nendfacet\n"
+    )
+    return "".join(shape.format(*row) for row in numbers).encode()

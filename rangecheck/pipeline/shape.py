@@ -1,109 +1,313 @@
-"""solid: from a surface to a part that can be built."""
+"""solid: from a surface to a part that can be built - closed, cut, scaled, thinned, hollowed, and only then proved and written."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from rangecheck.arrays import FloatArray
 from rangecheck.config import Settings
-from rangecheck.errors import NotSolid, OutputError
+from rangecheck.config.schema import Solidify
+from rangecheck.errors import NotSolid, OutputError, SettingError
+from rangecheck.files import write_json
 from rangecheck.pipeline.folder import check_writable
+from rangecheck.pipeline.health import versions
 from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.subject import eye_of, hashes, read_subject
 from rangecheck.progress import Reporter
-from rangecheck.solid import Solid, Verdict, check_solid, choose_base_height, close_relief, cut_flat, untangle
-from rangecheck.surface import Surface
-from rangecheck.surface.topology import is_closed
+from rangecheck.solid import Solid, Verdict, check_solid, choose_base_height, verdict
+from rangecheck.solid.base import UP, trimmed
+from rangecheck.solid.closing import Closed, close_surface
+from rangecheck.solid.hollow import Hollow, hollow
+from rangecheck.solid.printer import Printer
+from rangecheck.surface import ORIGIN_NAMES, Surface
+
+
+@dataclass
+class Made:
+    """What became of a surface: the solid or None, the verdict, and what was done and measured on the way."""
+
+    solid: Solid | None
+    verdict: Verdict
+    surface: Surface
+    closed: Closed | None = None
+    hollowed: Hollow | None = None
+    simplified: dict[str, Any] | None = None
+    facts: dict[str, Any] = field(default_factory=dict)
 
 
 def solid_of(
     surface: Surface, settings: Settings, reporter: Reporter, eye_mm: FloatArray | None = None
 ) -> tuple[Solid | None, Verdict]:
     """A solid of the surface - a relief closed, a bust cut flat - and the verdict; no solid when it cannot honestly be made one."""
+    made = make_solid(surface, settings, reporter, eye_mm)
+    return made.solid, made.verdict
+
+
+def make_solid(surface: Surface, settings: Settings, reporter: Reporter, eye_mm: FloatArray | None = None) -> Made:
+    """As `solid_of`, with all that was done."""
     wanted = settings.solid
+    with reporter.stage("closing"):
+        closed = _closed(surface, wanted, eye_mm, reporter)
+    made = Made(None, closed.after, closed.surface, closed)
+    if not _can_go_on(closed.after):
+        return made
     try:
-        made: Solid | Surface
-        with reporter.stage("closing"):
-            if is_closed(surface):
-                made = _untangled(surface, wanted.max_move_mm, reporter)
-            else:
-                made = close_relief(surface, back_mm=wanted.relief_depth_mm, eye_mm=eye_mm)
-                reporter.note("open surface closed as a relief: skirt and back plane along its outer loop")
         with reporter.stage("base"):
-            based = _based(made, settings, reporter)
-            if wanted.height_mm is not None:
-                based = _scaled(based, wanted.height_mm)
+            shaped = _based(_cut(closed.surface, wanted, reporter), wanted, reporter)
+            shaped = _scaled(shaped, wanted.height_mm, reporter) if wanted.height_mm is not None else shaped
+        if wanted.simplify_mm is not None:
+            with reporter.stage("simplifying"):
+                shaped = _simplified(shaped, made, wanted, reporter)
+        made.surface = shaped
+        if wanted.wall_mm is not None:
+            with reporter.stage("hollowing"):
+                shaped = _hollowed(shaped, made, wanted, reporter)
+        with reporter.stage("proving"):
+            made.solid = Solid.from_surface(shaped, severities=settings.checking.severities)
+        made.surface, made.verdict = shaped, made.solid.verdict
     except NotSolid as refusal:
         found = refusal.measured.get("verdict")
-        return None, found if isinstance(found, Verdict) else check_solid(surface)
-    return based, based.verdict
+        made.solid, made.verdict = None, found if isinstance(found, Verdict) else check_solid(made.surface)
+    return made
 
 
-def _untangled(surface: Surface, max_move_mm: float, reporter: Reporter) -> Surface:
-    """The surface with small folds loosened, none of its points moved by more than the leash."""
-    result = untangle(surface, max_move_mm=max_move_mm)
-    if result.before:
-        reporter.note(
-            f"{result.before} pairs of faces ran through each other; {result.after} do after moving {result.vertices_moved} "
-            f"vertices by at most {result.moved_mm:.3f} mm (leash {max_move_mm:g} mm)"
-        )
-    return result.surface
+def _can_go_on(judged: Verdict) -> bool:
+    """Whether what is closed and manifold may be cut and scaled, though faces of it may still cross: the proof at the end decides."""
+    return judged.facts["closed"] and not judged.has("non-manifold-vertices") and not judged.has("engine-refuses")
 
 
-def _based(made: Solid | Surface, settings: Settings, reporter: Reporter) -> Solid:
-    """Cut flat where it stands, and proved."""
-    wanted = settings.solid
-    surface = made.surface if isinstance(made, Solid) else made
-    if wanted.base_height_mm is not None:
-        return cut_flat(made, height_mm=float(surface.bounds_mm[0, 1]) + wanted.base_height_mm)
-    if wanted.base == "none" or "back" in surface.part_names:
-        return made if isinstance(made, Solid) else Solid.from_surface(made)
-    chosen = choose_base_height(made)
-    cut = cut_flat(made, height_mm=chosen.height_mm)
-    reporter.note(
-        f"base at {chosen.height_mm:.1f} mm: {chosen.reason}; {1 - cut.volume_mm3 / made.volume_mm3:.1%} of the volume goes"
+def _closed(surface: Surface, wanted: Solidify, eye_mm: FloatArray | None, reporter: Reporter) -> Closed:
+    closed = close_surface(
+        surface,
+        way=wanted.close,
+        back_mm=wanted.relief_depth_mm,
+        eye_mm=eye_mm,
+        max_move_mm=wanted.max_move_mm,
+        max_vanished=wanted.max_vanished_percent / 100,
+        longest_hole_mm=wanted.longest_hole_mm,
     )
+    if not closed.before.fit:
+        reporter.note(f"closed by {closed.way}: {closed.reason}")
+    for step in closed.steps:
+        reporter.note(step.message)
+    for refusal in closed.refused:
+        reporter.note(f"not mended: {refusal}")
+    return closed
+
+
+def _cut(surface: Surface, wanted: Solidify, reporter: Reporter) -> Surface:
+    if wanted.cut is None:
+        return surface
+    *normal, distance = wanted.cut
+    length = sum(x * x for x in normal) ** 0.5
+    if length == 0:
+        raise SettingError("setting solid.cut has a normal of length 0; give nx, ny, nz, d", key="solid.cut")
+    kept = trimmed(surface, height_mm=distance / length, up=normal, cap="cut")
+    reporter.note(
+        f"cut by the plane {', '.join(f'{x:g}' for x in wanted.cut)}: {1 - kept.volume_mm3 / surface.volume_mm3:.1%} of the volume goes"
+    )
+    return kept
+
+
+def _based(surface: Surface, wanted: Solidify, reporter: Reporter) -> Surface:
+    """Cut flat where it stands, on a socle or hollow behind where that is asked for."""
+    relief = "back" in surface.part_names
+    if relief and wanted.relief_back == "hollow":
+        from rangecheck.solid.relief_back import hollow_back
+
+        if wanted.wall_mm is None:
+            raise SettingError("a hollow back has a wall; say how thick with solid.wall_mm (--wall-mm)", key="solid.wall_mm")
+        before = surface.volume_mm3
+        surface = hollow_back(surface, wall_mm=wanted.wall_mm)
+        reporter.note(
+            f"back hollowed to a wall of {wanted.wall_mm:g} mm: {1 - surface.volume_mm3 / before:.1%} less resin, open behind"
+        )
+    if wanted.base_height_mm is not None:
+        height, reason = float(surface.bounds_mm[0, 1]) + wanted.base_height_mm, "asked for"
+    elif wanted.base == "none" or relief:
+        return surface
+    else:
+        chosen = choose_base_height(surface)
+        height, reason = chosen.height_mm, chosen.reason
+    cut = trimmed(surface, height_mm=height, up=UP)
+    reporter.note(f"base at {height:.1f} mm: {reason}; {1 - cut.volume_mm3 / surface.volume_mm3:.1%} of the volume goes")
+    if wanted.base == "socle":
+        from rangecheck.solid.socle import with_socle
+
+        cut = with_socle(cut, nameplate=wanted.nameplate)
+        reporter.note("a socle was put under it")
+    elif wanted.nameplate:
+        raise SettingError(
+            "a nameplate stands on a socle; ask for one with solid.base=socle (--base socle)", key="solid.nameplate"
+        )
     return cut
 
 
-def _scaled(made: Solid, height_mm: float) -> Solid:
-    """The same solid at another height; checked again, because what is sound at one size need not be at another."""
-    from dataclasses import replace
-
-    low, high = made.surface.bounds_mm
+def _scaled(surface: Surface, height_mm: float, reporter: Reporter) -> Surface:
+    """The same at another height; what follows sees it at that size, because what is sound at one size need not be at another."""
+    low, high = surface.bounds_mm
     scale = height_mm / float(high[1] - low[1])
-    error = made.surface.vertex_error_mm
-    scaled = replace(
-        made.surface, vertices=(made.surface.vertices - low) * scale, vertex_error_mm=None if error is None else error * scale
+    error = surface.vertex_error_mm
+    reporter.note(f"scaled by {scale:.4f} to {height_mm:g} mm")
+    return replace(surface, vertices=(surface.vertices - low) * scale, vertex_error_mm=None if error is None else error * scale)
+
+
+def printer_of(wanted: Solidify) -> Printer | None:
+    """The profile that the part is judged for, if one was named."""
+    from rangecheck.solid.printer import printer
+
+    return printer(wanted.printer) if wanted.printer else None
+
+
+def _simplified(surface: Surface, made: Made, wanted: Solidify, reporter: Reporter) -> Surface:
+    from rangecheck.solid.simplify import printable_error_mm, simplify
+
+    allowed = wanted.simplify_mm
+    if allowed == "auto":
+        profile = printer_of(wanted)
+        if profile is None:
+            raise SettingError(
+                "simplify_mm auto takes the error from a printer; name one with --printer, or give a length", key="solid.printer"
+            )
+        allowed = printable_error_mm(profile)
+    assert isinstance(allowed, float)
+    less = simplify(surface, error_mm=allowed)
+    made.simplified = {
+        "error_mm": less.error_mm,
+        "allowed_mm": allowed,
+        "faces_before": less.faces_before,
+        "faces_after": less.faces_after,
+    }
+    reporter.note(
+        f"simplified from {less.faces_before:,} to {less.faces_after:,} faces; either lies at most {less.error_mm:.4f} mm off the other "
+        f"({allowed:g} mm allowed)"
     )
-    return Solid.from_surface(scaled, notes=(*made.notes, f"scaled by {scale:.4f} to {height_mm:g} mm"))
+    return less.surface
 
 
-def solid(path: str, out: str, *, settings: Settings, unit: str | None, force: bool, reporter: Reporter) -> Outcome:
-    """A solid of what is in `path`, written as STL to `out` when it is one; otherwise the findings that stand against it."""
-    from rangecheck.export.stl import write_stl
+def _hollowed(surface: Surface, made: Made, wanted: Solidify, reporter: Reporter) -> Surface:
+    if wanted.relief_back == "hollow" and "back" in surface.part_names:
+        return surface
+    assert wanted.wall_mm is not None
+    result = made.hollowed = hollow(surface, wall_mm=wanted.wall_mm, drain_mm=wanted.drain_mm, up=wanted.print_up)
+    for note in result.notes:
+        reporter.note(note)
+    return result.surface
 
-    if Path(out).suffix.lower() != ".stl":
-        raise OutputError(out, "must end in .stl")
+
+def solid(
+    path: str,
+    out: str,
+    *,
+    settings: Settings,
+    unit: str | None,
+    force: bool,
+    reporter: Reporter,
+    ascii: bool = False,
+    force_open: bool = False,
+    orient: bool = False,
+) -> Outcome:
+    """A solid of what is in `path`, written to `out` (STL, 3MF, PLY, GLB, OBJ, OFF by its ending) when it is one, with a JSON beside it that
+    says where it came from; otherwise the findings that stand against it. `force_open` writes what is no solid all the same."""
+    from rangecheck.export.meshes import SUFFIXES, write_mesh
+    from rangecheck.pipeline.printable import printing_of
+    from rangecheck.solid.slicer import weld_distance_mm, weld_findings
+
+    if Path(out).suffix.lower() not in SUFFIXES:
+        raise OutputError(out, f"ends in {Path(out).suffix or 'nothing'}; a mesh ends in {', '.join(SUFFIXES)}")
     check_writable(out)
-    if Path(out).exists() and not force:
-        raise OutputError(out, "exists already; pass --force to replace it")
+    beside = Path(f"{out}.json")
+    for target in (Path(out), beside):
+        if target.exists() and not force:
+            raise OutputError(target, "exists already; pass --force to replace it")
+    printer_of(settings.solid)
     subject = read_subject(path, settings, unit, reporter)
-    made, verdict = solid_of(subject.surface, settings, reporter, eye_of(subject.scans))
-    if made is None:
+    made = make_solid(subject.surface, settings, reporter, eye_of(subject.scans))
+    lines, said = _story(made)
+    lines += findings_lines(made.verdict)
+    shares = {"parts": _areas(made.surface), "origins": {n: made.surface.share_of_area(k) for k, n in enumerate(ORIGIN_NAMES)}}
+    content = document(
+        "solid", output=None, solid=made.solid is not None, fit=made.solid is not None, verdict=made.verdict.to_dict(), **said, areas=shares,
+        options={"unit": unit, "ascii": ascii, "force_open": force_open, "settings": settings.model_dump(mode="json")},
+        inputs=hashes([path]), versions=versions(),
+    )  # fmt: skip
+    if made.solid is None and not force_open:
         return Outcome(
-            document("solid", output=None, verdict=verdict.to_dict(), inputs=hashes([path])),
-            [*findings_lines(verdict), "no STL was written"],
-            False,
+            content | {"seconds": reporter.seconds, "decisions": reporter.notes}, [*lines, "nothing was written"], False
         )
     with reporter.stage("exporting"):
-        written = write_stl(made, out, force=force)
-    lines = [f"{out}: {written.verdict.sentence()}, {written.faces:,} faces, read back and checked", *made.notes]
-    return Outcome(
-        document("solid", output=out, faces=written.faces, moved_by_rounding_mm=written.moved_mm, notes=made.notes,
-                 verdict=written.verdict.to_dict(), inputs=hashes([path]), seconds=reporter.seconds),
-        lines,
-    )  # fmt: skip
+        part = made.solid or made.surface
+        written = write_mesh(part, out, force=force, force_open=force_open, ascii=ascii, severities=settings.checking.severities)
+        plugs = _write_plugs(made, out, force)
+    fit = made.solid is not None
+    if made.solid is not None and written is not None:
+        near = weld_findings(written.read_back, severities=settings.checking.severities)
+        reread = verdict([*written.verdict.findings, *near], written.verdict.facts)
+        content["read_back"] = reread.to_dict() | {
+            "faces": written.faces, "moved_by_rounding_mm": written.moved_mm, "weld_mm": weld_distance_mm(written.read_back)
+        }  # fmt: skip
+        lines += [f"{out}: {written.faces:,} faces, read back as a slicer would and checked: {written.verdict.sentence()}"]
+        lines += [f"  {f.severity:<8} {f.code}: {f.message}" for f in near]
+        with reporter.stage("printing"):
+            printed, printing_lines = printing_of(made.solid, settings, orient=orient)
+        content |= printed
+        lines += printing_lines
+        fit = printed.get("fit", True)
+    else:
+        lines.append(f"{out}: written although it is no solid")
+    lines += [f"{path}: plug" for path in plugs]
+    content |= {"output": out, "plugs": plugs, "fit": fit, "seconds": reporter.seconds, "decisions": reporter.notes}
+    write_json(beside, content, force=force)
+    return Outcome(content, [*lines, f"{beside}: what it was made of, and how"], fit)
+
+
+def _story(made: Made) -> tuple[list[str], dict[str, Any]]:
+    """What was done, for people and for programs."""
+    lines: list[str] = []
+    said: dict[str, Any] = {"repair": None, "hollow": None, "simplified": made.simplified}
+    closed = made.closed
+    if closed is not None and (closed.steps or closed.refused):
+        rows = closed.table()
+        lines += [f"{'':<24} {'Original':>12} {'Final':>12}"]
+        lines += [f"{name:<24} {before:>12,} {after:>12,}" for name, before, after in rows]
+        lines += [
+            f"nothing outside filled places moved farther than {closed.moved_mm:.4f} mm; {closed.vanished:.3%} of the area is gone"
+        ]
+    if closed is not None:
+        said["repair"] = {
+            "way": closed.way, "reason": closed.reason, "steps": [vars(s) for s in closed.steps], "refused": closed.refused,
+            "moved_mm": closed.moved_mm, "vanished": closed.vanished,
+            "table": [{"what": w, "original": a, "final": b} for w, a, b in closed.table()],
+        }  # fmt: skip
+    if made.hollowed is not None:
+        lines += made.hollowed.lines()
+        said["hollow"] = made.hollowed.to_dict()
+    return lines, document("story", **said) | {"schema": "rangecheck/solid/1"}
+
+
+def _areas(surface: Surface) -> dict[str, dict[str, float]]:
+    """mm2 of each part by origin."""
+    areas = surface.face_areas
+    return {
+        name: {
+            origin: float(areas[(surface.part_of_face == part) & (surface.origin_of_face == k)].sum())
+            for k, origin in enumerate(ORIGIN_NAMES)
+        }
+        for part, name in enumerate(surface.part_names)
+    }
+
+
+def _write_plugs(made: Made, out: str, force: bool) -> list[str]:
+    from rangecheck.export.meshes import write_mesh
+
+    paths = []
+    for number, plug in enumerate(made.hollowed.plugs if made.hollowed else (), 1):
+        path = Path(out).with_name(f"{Path(out).stem}_plug_{number}{Path(out).suffix}")
+        write_mesh(plug, path, force=force)
+        paths.append(str(path))
+    return paths
 
 
 def findings_lines(verdict: Verdict) -> list[str]:

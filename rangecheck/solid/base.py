@@ -31,8 +31,19 @@ def cut_flat(solid: Solid | Surface, *, height_mm: float, up: npt.ArrayLike = UP
     """What of `solid` lies above the plane up . x = height_mm, capped there. A closed Surface will do: what is left of it is proved.
 
     Raises SurfaceError when nothing or all would remain, NotSolid when what remains is no solid."""
-    normal = _unit(up)
     whole, notes = (solid.surface, solid.notes) if isinstance(solid, Solid) else (solid, ())
+    surface = trimmed(whole, height_mm=height_mm, up=up)
+    removed = 1 - surface.volume_mm3 / whole.volume_mm3
+    note = f"cut flat at {height_mm:.3f} mm: {removed:.2%} of the volume went"
+    return Solid.from_surface(surface, notes=(*notes, note))
+
+
+def trimmed(whole: Surface, *, height_mm: float, up: npt.ArrayLike = UP, cap: str = "base") -> Surface:
+    """What of a closed surface lies above the plane up . x = height_mm, with a cap of part `cap`; closed and manifold, its solidity not
+    proved again. `up` points to what is kept, and need not be vertical.
+
+    Raises SurfaceError when nothing or all would remain, NotSolid when `whole` is not closed."""
+    normal = _unit(up)
     heights = whole.vertices @ normal
     low, high = float(heights.min()), float(heights.max())
     if not low < height_mm < high:
@@ -43,11 +54,7 @@ def cut_flat(solid: Solid | Surface, *, height_mm: float, up: npt.ArrayLike = UP
             high_mm=high,
         )
     engine, number = to_engine(whole)
-    kept = engine.trim_by_plane(tuple(normal), float(height_mm))
-    surface = from_engine(kept, [(number, whole)], "base")
-    removed = 1 - surface.volume_mm3 / whole.volume_mm3
-    note = f"cut flat at {height_mm:.3f} mm: {removed:.2%} of the volume went"
-    return Solid.from_surface(surface, notes=(*notes, note))
+    return from_engine(engine.trim_by_plane(tuple(normal), float(height_mm)), [(number, whole)], cap)
 
 
 def choose_base_height(solid: Solid | Surface, *, up: npt.ArrayLike = UP, most_removed: float = 0.35) -> BaseHeight:

@@ -112,3 +112,22 @@ def _provenance(mesh: Any, count: int) -> tuple[IntArray, IntArray]:
 def triangulate(rings: Sequence[FloatArray]) -> IntArray:
     """(k, 3) triangles over the points of plane rings (n, 2) taken one after another: outer rings counter-clockwise, holes clockwise."""
     return np.asarray(_manifold3d().triangulate([np.ascontiguousarray(r, np.float64) for r in rings]), np.int64).reshape(-1, 3)
+
+
+def cross_section(points: FloatArray | Sequence[FloatArray], margin_mm: float) -> Any:
+    """Plane shape: the hull of points (n, 2) widened by a rounded margin, or rings with their holes where a sequence is given."""
+    m3d = _manifold3d()
+    if not isinstance(points, np.ndarray):
+        return m3d.CrossSection([np.ascontiguousarray(r, np.float64) for r in points], m3d.FillRule.EvenOdd)
+    hull = m3d.CrossSection.hull_points(np.ascontiguousarray(points, np.float64))
+    return hull.offset(margin_mm, m3d.JoinType.Round, circular_segments=64) if margin_mm else hull
+
+
+def prism(section: Any, low_mm: float, high_mm: float) -> Any:
+    """A plane shape from one height to another along z."""
+    return section.extrude(high_mm - low_mm).translate((0.0, 0.0, low_mm))
+
+
+def hull_of(solids: Sequence[Any]) -> Any:
+    """The convex hull of the engine's solids."""
+    return _manifold3d().Manifold.batch_hull(list(solids))

@@ -8,7 +8,8 @@ what is drilled out is returned as plugs, smaller by a clearance. The wall is me
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -29,14 +30,19 @@ from rangecheck.surface.surface import INVENTED, Surface
 SIDES = 48
 #: how far a plug stays clear of its drain, all round
 CLEARANCE_MM = 0.1
-#: drilling stops after this many drains
-MOST_DRAINS = 12
+#: drilling stops after this many drains; so many places without room for a cavity are listed
+MOST_DRAINS, MOST_PLACES = 12, 24
 
 
 @dataclass(frozen=True)
 class Wall:
-    """The wall between cavity and outside, measured from the cavity: least, median and largest distance, and the share of the cavity's area
-    where it is within `tolerance_mm` of what was asked."""
+    """The wall between cavity and outside, measured both ways.
+
+    least_mm, median_mm, largest_mm, share_within  from the cavity to the outside, by the cavity's area; within `tolerance_mm` of `asked_mm`
+    outer_within  share of the outside's area from which the cavity is as far as was asked
+    full          places (x, y, z) of the outside, and their distance from the cavity, where the part's own shape leaves no room for one:
+                  edges, ears, noses; the farthest first, a few walls apart
+    """
 
     asked_mm: float
     least_mm: float
@@ -44,6 +50,8 @@ class Wall:
     largest_mm: float
     tolerance_mm: float
     share_within: float
+    outer_within: float = 1.0
+    full: tuple[tuple[float, float, float, float], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -57,19 +65,67 @@ class Drain:
 
 @dataclass(frozen=True, eq=False)
 class Hollow:
-    """solid, its plugs, the wall as measured, the drains, the pockets that still keep resin (empty: proved to drain), and what was saved."""
+    """The hollowed surface (closed and manifold; `solid` proves it), its plugs, the wall as measured, the drains, the pockets that still keep
+    resin (empty: proved to drain) when it stands along `up`, and the volume of the cavity."""
 
-    solid: Solid
+    surface: Surface
     plugs: tuple[Solid, ...]
     wall: Wall
     drains: tuple[Drain, ...]
     kept: tuple[Pocket, ...]
     cavity_mm3: float
+    up: tuple[float, float, float]
     notes: tuple[str, ...] = field(default=(), repr=False)
+
+    @cached_property
+    def solid(self) -> Solid:
+        """The hollowed part as a proven solid. Raises NotSolid."""
+        return Solid.from_surface(self.surface, notes=self.notes)
+
+    def lines(self) -> list[str]:
+        """Wall, drains and what is kept, for people."""
+        w = self.wall
+        lines = [
+            f"wall asked {w.asked_mm:g} mm; measured from the cavity {w.least_mm:.3f} to {w.largest_mm:.3f} mm, median {w.median_mm:.3f}, "
+            f"within {w.tolerance_mm:g} mm over {w.share_within:.2%} of its area; from outside over {w.outer_within:.1%}",
+        ]
+        if w.full:
+            listed = ", ".join(f"({x:.1f}, {y:.1f}, {z:.1f}) {d:.1f} mm" for x, y, z, d in w.full[:6])
+            lines.append(f"thicker where the shape leaves no room for a cavity: {listed}")
+        lines += [
+            f"drain of {d.diameter_mm:g} mm from ({', '.join(f'{x:.1f}' for x in d.inside_mm)}) to ({', '.join(f'{x:.1f}' for x in d.outside_mm)}) mm"
+            for d in self.drains
+        ]
+        tilt = ", ".join(f"{x:g}" for x in self.up)
+        if not self.kept:
+            lines.append(f"proved to drain with ({tilt}) up: from every cell of the cavity a way leads out that never rises")
+        lines += [
+            f"keeps {p.volume_mm3:.1f} mm3 with ({tilt}) up, {'closed for ever' if p.closed else f'{p.depth_mm:.1f} mm deep'}, lowest at "
+            f"({', '.join(f'{x:.1f}' for x in p.lowest_mm)}) mm"
+            for p in self.kept
+        ]
+        return lines
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready."""
+        return {
+            "wall": asdict(self.wall),
+            "drains": [
+                {"inside_mm": d.inside_mm.tolist(), "outside_mm": d.outside_mm.tolist(), "diameter_mm": d.diameter_mm}
+                for d in self.drains
+            ],
+            "kept": [
+                {"volume_mm3": p.volume_mm3, "depth_mm": p.depth_mm, "lowest_mm": p.lowest_mm.tolist(), "closed": p.closed}
+                for p in self.kept
+            ],
+            "cavity_mm3": self.cavity_mm3,
+            "plugs_mm3": [plug.volume_mm3 for plug in self.plugs],
+            "up": self.up,
+        }
 
 
 def hollow(
-    solid: Solid,
+    solid: Solid | Surface,
     *,
     wall_mm: float,
     up: npt.ArrayLike = (0.0, 1.0, 0.0),
@@ -78,56 +134,51 @@ def hollow(
     tolerance_mm: float = 0.15,
     least_pocket_mm3: float = 5.0,
 ) -> Hollow:
-    """`solid` with a cavity `wall_mm` below its surface and drains of `drain_mm` diameter (0: none) for standing along `up`.
+    """A solid, or a closed surface, with a cavity `wall_mm` below its surface and drains of `drain_mm` diameter (0: none) for standing along `up`.
 
     step_mm           grid of the cavity's surface; None means 0.4 walls
     least_pocket_mm3  pockets below this do not count as resin kept
     Raises SurfaceError when nothing lies deeper than the wall."""
     if not (wall_mm > 0 and drain_mm >= 0):
         raise SettingError(f"wall_mm is {wall_mm} and drain_mm {drain_mm}; lengths are needed", key="wall_mm")
-    inner = inner_offset(solid.surface, wall_mm, step_mm or 0.4 * wall_mm)
+    outside, notes = (solid.surface, solid.notes) if isinstance(solid, Solid) else (solid, ())
+    inner = inner_offset(outside, wall_mm, step_mm or 0.4 * wall_mm)
     inner = _without_specks(inner, (drain_mm or wall_mm) ** 3) if inner is not None else None
     if inner is None:
         raise SurfaceError(
             f"nothing lies {wall_mm:g} mm deep in the part, so a wall of {wall_mm:g} mm leaves no cavity; ask for a thinner wall",
             wall_mm=wall_mm,
         )
-    outer, outer_name = to_engine(solid.surface)
     # the grid's many faces say no more than a few: collapsed within a small part of the tolerance
     inner = simplified(inner, tolerance_mm / 10)
+    outer, outer_name = to_engine(outside)
     cavity, cavity_name = to_engine(inner)
-    sources = [(outer_name, solid.surface), (cavity_name, inner)]
-    made = outer - cavity
+    sources = [(outer_name, outside), (cavity_name, inner)]
+    wall = outer - cavity
     drains: list[Drain] = []
     plugs: list[Solid] = []
-    surface = from_engine(made, sources, "drain")
-    kept = _kept(surface, solid, up, wall_mm, least_pocket_mm3)
+    made, surface = wall, from_engine(wall, sources, "drain")
+    kept = _kept(surface, outside, up, wall_mm, least_pocket_mm3)
     while kept and drain_mm > 0 and len(drains) < MOST_DRAINS:
-        drain = _drain_for(kept[0], solid.surface, up, wall_mm, drain_mm)
-        made = made - _rod(drain, drain.diameter_mm / 2, wall_mm)
-        plugs += _plug(outer - cavity, drain, wall_mm)
+        drain = _drain_for(kept[0], outside, up, wall_mm, drain_mm)
+        rod = _rod(drain, drain.diameter_mm / 2, wall_mm)
+        made = made - rod
+        plugs += _plug(wall, rod, drain, wall_mm)
         drains.append(drain)
         surface = from_engine(made, sources, "drain")
         before = kept
-        kept = _kept(surface, solid, up, wall_mm, least_pocket_mm3)
+        kept = _kept(surface, outside, up, wall_mm, least_pocket_mm3)
         if kept and np.allclose(kept[0].lowest_mm, before[0].lowest_mm) and kept[0].volume_mm3 >= 0.99 * before[0].volume_mm3:
             break
     volume = inner.volume_mm3
-    notes = (
+    x, y, z = (float(value) for value in frame_of(up)[2])
+    done = (
         f"hollowed to a wall of {wall_mm:g} mm: {volume / 1000:.2f} cm3 less resin",
         f"{len(drains)} drains of {drain_mm:g} mm; "
         + (f"{len(kept)} pockets keep {sum(p.volume_mm3 for p in kept):.1f} mm3" if kept else "every pocket drains"),
     )
-    proved = Solid.from_surface(surface, notes=(*solid.notes, *notes))
-    return Hollow(
-        proved,
-        tuple(plugs),
-        measured_wall(solid.surface, inner, wall_mm, tolerance_mm),
-        tuple(drains),
-        tuple(kept),
-        volume,
-        notes,
-    )
+    measured = measured_wall(outside, inner, wall_mm, tolerance_mm)
+    return Hollow(surface, tuple(plugs), measured, tuple(drains), tuple(kept), volume, (x, y, z), (*notes, *done))
 
 
 def _without_specks(inner: Surface, least_mm3: float) -> Surface | None:
@@ -143,24 +194,35 @@ def _without_specks(inner: Surface, least_mm3: float) -> Surface | None:
 
 
 def measured_wall(outer: Surface, inner: Surface, asked_mm: float, tolerance_mm: float) -> Wall:
-    """The wall between an outer surface and a cavity, over the cavity's area."""
+    """The wall between an outer surface and a cavity, over the area of both."""
     samples = sample_surface(inner, max(asked_mm, inner.extent_mm / 200))
     distance, _ = SurfaceDistance(outer).distance_mm(samples.places_mm)
     order = np.argsort(distance, kind="stable")
     cumulated = np.cumsum(samples.area_mm2[order])
     median = float(distance[order][np.searchsorted(cumulated, cumulated[-1] / 2)])
     within = float(samples.area_mm2[np.abs(distance - asked_mm) <= tolerance_mm].sum() / cumulated[-1])
-    return Wall(asked_mm, float(distance.min()), median, float(distance.max()), tolerance_mm, within)
+    outside = sample_surface(outer, max(asked_mm, outer.extent_mm / 200))
+    far, _ = SurfaceDistance(inner).distance_mm(outside.places_mm)
+    thick = far > asked_mm + tolerance_mm
+    full: list[tuple[float, float, float, float]] = []
+    waiting = np.flatnonzero(thick)[np.argsort(-far[thick], kind="stable")]
+    while len(waiting) and len(full) < MOST_PLACES:
+        x, y, z = (float(v) for v in outside.places_mm[waiting[0]])
+        full.append((x, y, z, float(far[waiting[0]])))
+        apart = np.linalg.norm(outside.places_mm[waiting] - outside.places_mm[waiting[0]], axis=1)
+        waiting = waiting[apart > 8 * asked_mm]
+    share = float(outside.area_mm2[np.abs(far - asked_mm) <= tolerance_mm].sum() / outside.area_mm2.sum())
+    return Wall(asked_mm, float(distance.min()), median, float(distance.max()), tolerance_mm, within, share, tuple(full))
 
 
-def _kept(surface: Surface, solid: Solid, up: npt.ArrayLike, wall_mm: float, least_mm3: float) -> list[Pocket]:
+def _kept(surface: Surface, outside: Surface, up: npt.ArrayLike, wall_mm: float, least_mm3: float) -> list[Pocket]:
     """Pockets of the cavity that keep resin; hollows of the outside, which held water before, are not the cavity's."""
     step = max(wall_mm / 3, float(np.ptp(surface.vertices, axis=0).max()) / 256)
     found = pockets(surface, up, step_mm=step, least_mm3=least_mm3)
     if not found:
         return []
     places = np.array([p.lowest_mm for p in found])
-    depth, _ = SurfaceDistance(solid.surface).signed_distance_mm(places)
+    depth, _ = SurfaceDistance(outside).signed_distance_mm(places)
     return [p for p, d in zip(found, depth) if d < -wall_mm / 2]
 
 
@@ -189,11 +251,13 @@ def _rod(drain: Drain, radius_mm: float, wall_mm: float) -> Any:
     return rod.transform(np.column_stack([frame.T, start]))
 
 
-def _plug(wall: Any, drain: Drain, wall_mm: float) -> list[Solid]:
+def _plug(wall: Any, rod: Any, drain: Drain, wall_mm: float) -> list[Solid]:
     """What the drain takes out of the wall, smaller all round by the clearance: flush outside, and inside as the cavity is."""
+    # only the neighbourhood of the rod: the whole wall need not be divided again
+    taken = wall ^ rod
     radius = drain.diameter_mm / 2 - CLEARANCE_MM
     if radius <= 0:
         return []
-    cut = wall ^ _rod(drain, radius, wall_mm)
+    cut = taken ^ _rod(drain, radius, wall_mm)
     pieces = [p for p in cut.decompose() if p.volume() > 0.1 * math.pi * radius**2 * wall_mm]
     return [Solid.from_surface(from_engine(p, [], "plug", INVENTED)) for p in pieces]

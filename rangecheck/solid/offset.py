@@ -1,8 +1,8 @@
 """The surface at a given depth inside a solid: the zero set of signed distance plus depth.
 
-A grid is looked at in blocks of 8 cells a side. Distance changes by at most 1 mm per mm, so a block whose middle is farther from the
-depth than half its diagonal holds no part of the zero set and is never filled. In the others every cell is cut into six tetrahedra along
-its diagonal (Kuhn 1960), which fit together across cells, so that the zero set is closed and manifold by construction. Vertices are
+A grid is looked at in blocks of 16 cells a side, then of 8, 4 and 2. Distance changes by at most 1 mm per mm, so a block whose middle is
+farther from the depth than half its diagonal holds no part of the zero set and is not looked at again. In those of 2 that are left every
+cell is cut into six tetrahedra along its diagonal (Kuhn 1960), which fit together across cells, so that the zero set is closed and manifold by construction. Vertices are
 interpolated along edges: exact for planes, off by step^2 / (8 radius) on curved walls; ridges, where the nearest side changes, are rounded
 within a cell.
 """
@@ -17,30 +17,37 @@ from rangecheck.kernels import kernel
 from rangecheck.surface.distance import SurfaceDistance
 from rangecheck.surface.surface import INVENTED, Surface
 
-BLOCK = 8
+COARSEST, BLOCK = 16, 2
 #: corners of a cell as bits x, y, z; each path from corner 0 to corner 7 along three sides is one tetrahedron
 _PATHS = np.array([[0, 1, 3, 7], [0, 1, 5, 7], [0, 2, 3, 7], [0, 2, 6, 7], [0, 4, 5, 7], [0, 4, 6, 7]])
 #: whether each tetrahedron's corners, in this order, span a positive volume
 _POSITIVE = np.array([True, False, False, True, True, False])
 
 
-def inner_offset(surface: Surface, depth_mm: float, step_mm: float, *, most_blocks: int = 400_000) -> Surface | None:
+def inner_offset(surface: Surface, depth_mm: float, step_mm: float, *, most_blocks: int = 50_000) -> Surface | None:
     """The closed surface `depth_mm` inside a closed `surface`, facing outwards as a body of its own, on a grid of `step_mm`; None where
     nothing lies so deep. Raises SurfaceError when the grid would be too fine."""
     distance = SurfaceDistance(surface)
     low, high = surface.bounds_mm
     # an odd share of a step, so that flat faces do not fall onto nodes
     origin = low - np.array([0.37, 0.41, 0.43]) * step_mm
-    shape = np.ceil((high - origin) / (BLOCK * step_mm)).astype(np.int64)
+    shape = np.ceil((high - origin) / (COARSEST * step_mm)).astype(np.int64)
     if int(shape.prod()) > most_blocks:
         raise SurfaceError(f"a step of {step_mm:g} mm makes {int(shape.prod())} blocks; choose a larger one", step_mm=step_mm)
     block = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1).reshape(-1, 3)
-    middle = origin + (block + 0.5) * (BLOCK * step_mm)
-    value = distance.signed_distance_mm(middle)[0] + depth_mm
-    block = block[np.abs(value) <= 0.5 * np.sqrt(3.0) * BLOCK * step_mm]
-    if not len(block):
-        return None
-    nodes = shape * BLOCK + 1
+    size = COARSEST
+    while True:
+        middle = origin + (block + 0.5) * (size * step_mm)
+        value = distance.signed_distance_mm(middle)[0] + depth_mm
+        block = block[np.abs(value) <= 0.5 * np.sqrt(3.0) * size * step_mm]
+        if not len(block):
+            return None
+        if size == BLOCK:
+            break
+        halves = np.stack(np.meshgrid(*(np.arange(2),) * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        block = (2 * block[:, None] + halves).reshape(-1, 3)
+        size //= 2
+    nodes = shape * COARSEST + 1
     corner = np.stack(np.meshgrid(*(np.arange(BLOCK + 1),) * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     index = (block[:, None] * BLOCK + corner).reshape(-1, 3)
     number = np.ravel_multi_index(tuple(index.T), tuple(nodes))

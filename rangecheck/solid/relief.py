@@ -25,8 +25,9 @@ from rangecheck.surface.patches import neighbours_of, refined, smooth_values, tu
 from rangecheck.surface.predicates import side_of_line
 from rangecheck.surface.surface import INVENTED, Surface
 
-#: gaps up to this many typical edges wide are bridged at the outer rim
-GAP_EDGES = 6.0
+#: gaps up to this many typical edges wide are bridged at the outer rim, and wider ones where pieces would else fall apart: up to this
+#: share of the relief's extent
+GAP_EDGES, GAP_SHARE = 6.0, 0.1
 #: pieces with less than this share of the largest one's area in (u, v) are dropped
 ISLAND_SHARE = 0.02
 
@@ -86,7 +87,8 @@ def close_relief(
     """A solid whose front is `surface` and whose back is a plane `back_mm` behind its deepest point.
 
     eye_mm       (3,) where the scan was taken from; None means parallel rays against the mean normal
-    gap_mm       width up to which gaps of the outer rim are bridged; None means GAP_EDGES typical edges. Inner holes are all filled
+    gap_mm       width up to which gaps of the outer rim are bridged; None means GAP_EDGES typical edges, or what keeps the pieces together,
+                 but at most GAP_SHARE of the extent. Inner holes are all filled
     island_share pieces below this share of the largest one's area are dropped
 
     Filled faces are of part "filled", the rest of "skirt" and "back", all invented. Raises SurfaceError when there is no relief to
@@ -101,7 +103,7 @@ def close_relief(
     kept = _visible(surface, uv, depth, notes)
     kept = _without_islands(surface, kept, uv, island_share, notes)
     typical = float(np.median(np.linalg.norm(uv[surface.faces[kept][:, 1]] - uv[surface.faces[kept][:, 0]], axis=1)))
-    gap = GAP_EDGES * typical if gap_mm is None else gap_mm
+    gap = _gap_that_joins(uv, surface.faces[kept], GAP_EDGES * typical, notes) if gap_mm is None else gap_mm
     kept, filling = _one_disc(uv, surface.faces, kept, gap, notes)
     uv, depth, front, fill_count = _with_filling(uv, depth, surface.faces[kept], filling)
     closed = _with_skirt(surface, view, uv, depth, front, kept, back_mm)
@@ -202,8 +204,43 @@ def _smaller_fans(flat: Surface, areas: FloatArray) -> BoolArray:
     return doomed
 
 
+def _gap_that_joins(uv: FloatArray, faces: IntArray, least_mm: float, notes: list[str]) -> float:
+    """The narrowest gap, at least `least_mm`, whose bridging makes one piece of all; `least_mm` when that is too wide."""
+    count, shell = topo.shells(_flat_surface(uv, faces))
+    if count == 1:
+        return least_mm
+    piece = np.full(len(uv) + 4, -1)
+    piece[faces] = shell[:, None]
+    between, longest = _outside(uv, faces)
+    pieces = piece[between]
+    joins = (pieces >= 0).all(axis=1) & (pieces != pieces[:, :1]).any(axis=1)
+    group = np.arange(count)
+    for triangle in np.flatnonzero(joins)[np.argsort(longest[joins], kind="stable")]:
+        met = np.unique(group[pieces[triangle]])
+        group[np.isin(group, met)] = met[0]
+        if (group == group[0]).all():
+            needed = float(longest[triangle]) * (1 + 1e-9)
+            widest = GAP_SHARE * float(np.ptp(uv[faces].reshape(-1, 2), axis=0).max())
+            if least_mm < needed <= widest:
+                notes.append(
+                    f"{count} pieces lie apart by up to {needed:.1f} mm; gaps that wide were bridged, so that they hang together"
+                )
+                return needed
+            break
+    return least_mm
+
+
 def _filling(uv: FloatArray, faces: IntArray, gap_mm: float) -> IntArray:
     """Triangles over the rims of `faces` that fill all holes and the outer gaps narrower than `gap_mm`."""
+    outside, longest = _outside(uv, faces)
+    wide = (outside >= len(uv)).any(axis=1) | (longest > gap_mm)
+    # what is wide stays open only where it can be reached from the frame through wide triangles
+    across = neighbours_of(outside, len(uv) + 4)
+    return outside[~_reached((outside >= len(uv)).any(axis=1), wide, across)]
+
+
+def _outside(uv: FloatArray, faces: IntArray) -> tuple[IntArray, FloatArray]:
+    """Triangles (k, 3) over the rims of `faces` and the four corners of a frame around them (numbered last), and the longest side of each."""
     low, high = uv[faces].reshape(-1, 2).min(axis=0), uv[faces].reshape(-1, 2).max(axis=0)
     margin = (high - low).max()
     (x0, y0), (x1, y1) = low - margin, high + margin
@@ -216,10 +253,7 @@ def _filling(uv: FloatArray, faces: IntArray, gap_mm: float) -> IntArray:
     across = neighbours_of(outside, len(points))
     turn_diagonals(points, outside, across, np.zeros(len(outside), np.bool_))
     corners = points[outside]
-    longest = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2).max(axis=1)
-    wide = (outside >= len(uv)).any(axis=1) | (longest > gap_mm)
-    # what is wide stays open only where it can be reached from the frame through wide triangles
-    return outside[~_reached((outside >= len(uv)).any(axis=1), wide, across)]
+    return outside, np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2).max(axis=1)
 
 
 @kernel

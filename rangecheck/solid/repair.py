@@ -61,15 +61,18 @@ class Repaired:
 
     def table(self) -> list[tuple[str, Any, Any]]:
         """Rows (what, original, final)."""
-        codes = dict.fromkeys(f.code for v in (self.before, self.after) for f in v.findings)
-        rows: list[tuple[str, Any, Any]] = [
-            (name, self.before.facts[name], self.after.facts[name]) for name in ("vertices", "faces", "shells")
-        ]
+        return compared(self.before, self.after)
 
-        def count(verdict: Verdict, code: str) -> int:
-            return verdict.get(code).count if verdict.has(code) else 0
 
-        return rows + [(code, count(self.before, code), count(self.after, code)) for code in codes]
+def compared(before: Verdict, after: Verdict) -> list[tuple[str, Any, Any]]:
+    """Rows (what, original, final): sizes, then every kind of defect that either has."""
+    codes = dict.fromkeys(f.code for v in (before, after) for f in v.findings)
+    rows: list[tuple[str, Any, Any]] = [(name, before.facts[name], after.facts[name]) for name in ("vertices", "faces", "shells")]
+
+    def count(verdict: Verdict, code: str) -> int:
+        return verdict.get(code).count if verdict.has(code) else 0
+
+    return rows + [(code, count(before, code), count(after, code)) for code in codes]
 
 
 def repair(
@@ -117,7 +120,7 @@ def repair(
         steps.append(Step("collapse-flat", gone, f"{gone} of {count} faces without area removed by turning diagonals"))
     mended = _turned(mended, steps)
     after = check_solid(mended)
-    moved, vanished = _leash(surface, mended)
+    moved, vanished = leash(surface, mended)
     return Repaired(mended, tuple(steps), tuple(refused), moved, vanished, before, after)
 
 
@@ -265,7 +268,7 @@ def _cut_out(surface: Surface, max_vanished: float) -> tuple[Surface, float] | N
     return None
 
 
-def _leash(given: Surface, mended: Surface) -> tuple[float, float]:
+def leash(given: Surface, mended: Surface) -> tuple[float, float]:
     """Farthest way between the two surfaces outside filled and dropped faces, and the share of area that is gone."""
     if not len(mended.faces) or not len(given.faces):
         return 0.0, 1.0

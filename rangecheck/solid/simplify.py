@@ -7,6 +7,7 @@ merged, so what was measured and what was invented can still be told apart.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -20,13 +21,21 @@ from rangecheck.surface.surface import Surface
 
 @dataclass(frozen=True, eq=False)
 class Simplified:
-    """solid with fewer faces; error_mm: farthest that either surface lies from the other at their vertices and face middles; its faces
-    before and after."""
+    """surface with fewer faces (closed and manifold; `solid` proves it); error_mm: farthest that either surface lies from the other at their
+    vertices and face middles; its faces before and after."""
 
-    solid: Solid
+    surface: Surface
     error_mm: float
     faces_before: int
     faces_after: int
+
+    @cached_property
+    def solid(self) -> Solid:
+        """The simplified part as a proven solid. Raises NotSolid."""
+        words = (
+            f"simplified from {self.faces_before} to {self.faces_after} faces, nowhere off by more than {self.error_mm:.4f} mm"
+        )
+        return Solid.from_surface(self.surface, notes=(words,))
 
 
 def printable_error_mm(printer: Printer) -> float:
@@ -34,25 +43,22 @@ def printable_error_mm(printer: Printer) -> float:
     return min(printer.pixel_mm, printer.layer_mm) / 4
 
 
-def simplify(solid: Solid, *, error_mm: float) -> Simplified:
-    """`solid` with fewer triangles, nowhere farther than `error_mm` from what it was.
+def simplify(solid: Solid | Surface, *, error_mm: float) -> Simplified:
+    """A solid, or a closed surface, with fewer triangles, nowhere farther than `error_mm` from what it was.
 
     The engine's tolerance bounds each collapse; the error that adds up is measured both ways, and the tolerance halved until it keeps the
     promise. Raises SettingError for an error that is no length."""
     if not (np.isfinite(error_mm) and error_mm > 0):
         raise SettingError(f"error_mm is {error_mm}; a positive length is needed", key="error_mm")
+    given = solid.surface if isinstance(solid, Solid) else solid
     tolerance = error_mm
     for _ in range(6):
-        surface = simplified(solid.surface, tolerance)
-        measured = _apart(solid.surface, surface)
+        surface = simplified(given, tolerance)
+        measured = _apart(given, surface)
         if measured <= error_mm and surface.volume_mm3 > 0:
-            break
+            return Simplified(surface, measured, len(given.faces), len(surface.faces))
         tolerance /= 2
-    else:
-        return Simplified(solid, 0.0, len(solid.surface.faces), len(solid.surface.faces))
-    note = f"simplified from {len(solid.surface.faces)} to {len(surface.faces)} faces, nowhere off by more than {measured:.4f} mm"
-    made = Solid.from_surface(surface, notes=(*solid.notes, note))
-    return Simplified(made, measured, len(solid.surface.faces), len(surface.faces))
+    return Simplified(given, 0.0, len(given.faces), len(given.faces))
 
 
 def _apart(one: Surface, other: Surface) -> float:

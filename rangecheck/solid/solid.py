@@ -39,9 +39,7 @@ class Solid:
             raise NotSolid("a Solid is made by Solid.from_surface(), which checks it; it cannot be claimed", findings=())
 
     @classmethod
-    def from_surface(
-        cls, surface: Surface, *, notes: tuple[str, ...] = (), severities: Mapping[str, str] | None = None
-    ) -> Solid:
+    def from_surface(cls, surface: Surface, *, notes: tuple[str, ...] = (), severities: Mapping[str, str] | None = None) -> Solid:
         """`surface` as a Solid. `severities` overrides those of findings by code; what is in HARD stands against it whatever they say.
         Raises NotSolid, whose `findings` and `verdict` say why not and where."""
         judged = check_solid(surface, severities=severities)
