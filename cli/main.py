@@ -31,6 +31,7 @@ COMMANDS = {
     "explain": "Say what a finding means, why it matters and what mends it.",
     "init": "Write a settings file with every setting, its default, range and meaning.",
     "completion": "Print the script that lets a shell complete commands and options.",
+    "report": "Make the report of a finished job again, with the charts of studies.",
     "doctor": "Say what is installed, what is missing, and the line that mends it.",
 }
 

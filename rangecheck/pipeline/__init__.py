@@ -22,6 +22,7 @@ _WHERE = {
     "mesh": "scanning",
     "rehearse": "beginning",
     "render": "pictures",
+    "report": "page",
     "run": "job",
     "sample": "scanning",
     "simulate": "scanning",

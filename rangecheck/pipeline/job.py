@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from rangecheck import report
 from rangecheck.config import Settings
 from rangecheck.errors import PosesRefused
 from rangecheck.export.map_files import write_maps
@@ -17,12 +16,12 @@ from rangecheck.export.meshes import write_mesh
 from rangecheck.export.pictures import png_bytes
 from rangecheck.export.stl import write_stl
 from rangecheck.export.video import find_encoder
-from rangecheck.files import read_bytes, write_bytes, write_json
+from rangecheck.files import write_bytes, write_json
 from rangecheck.pipeline.folder import check_free, job_folder, key_of
 from rangecheck.pipeline.health import versions
 from rangecheck.pipeline.inspect import scan_facts
 from rangecheck.pipeline.outcome import Outcome, document
-from rangecheck.pipeline.page import contours_of, page_of
+from rangecheck.pipeline.page import contours_of, keep_for_report, page_of
 from rangecheck.pipeline.preparing import prepared
 from rangecheck.pipeline.scanning import refused
 from rangecheck.pipeline.shape import findings_lines, solid_of
@@ -30,6 +29,7 @@ from rangecheck.pipeline.subject import eye_of, hashes, read_all_scans, surface_
 from rangecheck.pipeline.turning import render_turntable
 from rangecheck.pipeline.views import map_at, orbit_of
 from rangecheck.progress import Reporter
+from rangecheck.report import write_report
 from rangecheck.solid import Finding, Verdict, finding, verdict
 from rangecheck.surface import INVENTED, ORIGIN_NAMES, Surface
 
@@ -64,10 +64,9 @@ def run(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None,
             for name in settings.light.materials
         ]
         with reporter.stage("contours"):
-            contours = {scan.name: png_bytes(contours_of(scan, settings)) for scan in read}
-            for name, picture in contours.items():
-                write_bytes(folder / "contours" / f"{name}.png", picture)
-        distance_maps = _distance_maps(shown, folder, settings, reporter)
+            for scan in read:
+                write_bytes(folder / "contours" / f"{scan.name}.png", png_bytes(contours_of(scan, settings)))
+        _distance_maps(shown, folder, settings, reporter)
 
         stl: dict[str, Any] | None = None
         (folder / "bust.stl").unlink(missing_ok=True)
@@ -93,8 +92,8 @@ def run(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None,
             peak_memory_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         )  # fmt: skip
         with reporter.stage("report"):
-            page = page_of(content, judged, read, contours, distance_maps, turntables)
-            report.write_report(page, folder / "report.html")
+            keep_for_report(folder, shown, surface, read, judged if made is not None else None, settings)
+            write_report(page_of(folder, content), folder / "report.html")
         content["seconds"] = dict(reporter.seconds)
         write_json(folder / FINISHED, content)
     total = sum(reporter.seconds.values())
@@ -128,13 +127,9 @@ def _with_scan_findings(judged: Verdict, shown: Surface, settings: Settings) -> 
     return verdict(found, facts)
 
 
-def _distance_maps(shown: Surface, folder: Path, settings: Settings, reporter: Reporter) -> list[tuple[str, bytes]]:
-    found = []
+def _distance_maps(shown: Surface, folder: Path, settings: Settings, reporter: Reporter) -> None:
     with reporter.stage("distance maps", len(settings.maps.azimuths_deg)):
         for index, azimuth in enumerate(settings.maps.azimuths_deg):
             measured, where = map_at(shown, settings, azimuth)
-            where_to = folder / "maps" / f"azimuth_{azimuth:g}"
-            write_maps(where_to, measured, subtitle=where)
-            found.append((where, read_bytes(where_to / "distance.png")))
+            write_maps(folder / "maps" / f"azimuth_{azimuth:g}", measured, subtitle=where)
             reporter.advance(index + 1)
-    return found

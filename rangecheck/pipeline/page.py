@@ -1,19 +1,56 @@
-"""What the report of a job shows, gathered from what the job made, in the order in which a person decides."""
+"""The report of a job: what it needs is kept in the job's folder, so that the page can be made again without the job.
+
+`keep_for_report` writes brightness/, likeness.npz and maps/ring.npz; `page_of` reads them, the other results and run.json's content.
+"""
 
 from __future__ import annotations
 
+import io
 import json
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
-from rangecheck import report
+from rangecheck.animation import orbit_around
 from rangecheck.config import Settings
+from rangecheck.errors import InputError
+from rangecheck.export.map_files import read_maps_npz
 from rangecheck.export.mapped import contour_picture
 from rangecheck.export.pictures import png_bytes
-from rangecheck.pipeline.turning import Rendered
+from rangecheck.files import read_bytes, read_json, whole_file, write_bytes
+from rangecheck.maps import trace_maps
+from rangecheck.optics import PinholeCamera
+from rangecheck.pipeline.likeness import coverage, likeness
+from rangecheck.pipeline.outcome import Outcome, document
+from rangecheck.progress import Reporter
+from rangecheck.raycast import EmbreeCaster
+from rangecheck.report import (
+    Coverage,
+    DistanceMap,
+    Field,
+    Figure,
+    Finding,
+    Model,
+    ReportContent,
+    Scan,
+    Turntable,
+    write_report,
+)
 from rangecheck.scan import RangeScan
 from rangecheck.solid import Verdict
+from rangecheck.surface import Surface
+
+#: focal points of the ring, and the longer side of their maps in pixels
+RING_DEG = tuple(float(a) for a in range(0, 360, 30))
+RING_PX = 240
+_ABOUT = {
+    "error_mm": "Expected standard error of the surface along its normal, from the noise and number of the readings behind it. Grey: nothing was measured.",
+    "deviation_mm": "Mean signed distance of the scans' readings nearest to each point, positive outside. Grey: no reading lies there.",
+    "thickness_mm": "Straight inwards to the opposite side, the least around each point. Grey: no side faces it there.",
+}
 
 
 def contours_of(scan: RangeScan, settings: Settings) -> Any:
@@ -23,63 +60,173 @@ def contours_of(scan: RangeScan, settings: Settings) -> Any:
     )
 
 
-def page_of(
-    content: dict[str, Any],
-    judged: Verdict,
-    read: list[RangeScan],
-    contours: dict[str, bytes],
-    distance_maps: list[tuple[str, bytes]],
-    turntables: list[Rendered],
-) -> report.ReportContent:
-    """What the report shows, in the order in which a person decides."""
-    shares = content["area_shares"]
-    reasons = [
-        judged.sentence(),
-        f"{shares['measured']:.0%} of the surface is measured, {shares['interpolated']:.0%} interpolated, {shares['invented']:.0%} invented",
-        f"meshed by {content['method']}: {content['reason']}",
-    ]
-    pictures = [
-        report.Figure(name, "iso-lines of depth over the scan's own relief", picture) for name, picture in contours.items()
-    ]
-    pictures += [
-        report.Figure(scan.name, "brightness, as the scanner's camera saw it", png_bytes(_brightness(scan)))
-        for scan in read
-        if scan.brightness is not None
-    ]
-    scan_section = report.Section(
-        "Scans",
-        "What came in: cells without a return stay without one, they are never points.",
-        [(fact["name"], f"{fact['valid']:,} distances, {fact['valid_share']:.0%} of the grid") for fact in content["scans"]]
-        + _worth(content["quality"]),
-        pictures,
+def keep_for_report(
+    folder: Path,
+    shown: Surface,
+    meshed: Surface,
+    scans: Sequence[RangeScan],
+    found: Verdict | None,
+    settings: Settings,
+) -> None:
+    """Write what only the running job knows: the scans' brightness, the bust's likeness, distances from a ring of focal points.
+
+    `found` names faces of `shown`; None when they are not its own."""
+    for scan in scans:
+        if scan.brightness is not None:
+            grey = np.rint(255 * np.nan_to_num(np.clip(scan.brightness, 0, 1))).astype(np.uint8)
+            write_bytes(folder / "brightness" / f"{scan.name}.png", png_bytes(grey))
+    made = likeness(shown, meshed, scans, found, same_place=settings.solid.height_mm is None)
+    light = made.surface
+    _write_arrays(
+        folder / "likeness.npz",
+        vertices_mm=light.vertices.astype(np.float32),
+        faces=light.faces,
+        part_of_face=light.part_of_face,
+        origin_of_face=light.origin_of_face,
+        part_names=np.array(light.part_names),
+        error_mm=made.error_mm.astype(np.float32),
+        deviation_mm=made.deviation_mm.astype(np.float32),
+        thickness_mm=made.thickness_mm.astype(np.float32),
+        flagged=made.flagged,
+        off_mm=np.array([made.off_mm, made.off_99_mm]),
+        faces_before=np.array(made.faces),
+        coverage=coverage(scans, meshed.bounds_mm.mean(axis=0)),
     )
-    map_section = report.Section(
-        "Distance maps",
-        "Length from a focal point to the surface, from places where no scan was taken.",
-        figures=[report.Figure("Distance", where, picture) for where, picture in distance_maps],
+    shrink = min(1.0, RING_PX / max(settings.picture.width, settings.picture.height))
+    size = {key: max(8, round(shrink * getattr(settings.picture, key))) for key in ("width", "height")}
+    camera = PinholeCamera.from_field_of_view(size["width"], size["height"], settings.picture.field_of_view_deg)
+    caster = EmbreeCaster(shown.vertices, shown.faces)
+    orbit = orbit_around(
+        shown, camera, frames=len(RING_DEG), elevation_deg=settings.maps.elevation_deg, margin=settings.turntable.margin
     )
-    findings = [
-        report.Finding(
-            f.code, f.severity, f.count, f.message,
-            "; ".join("(" + ", ".join(f"{x:.1f}" for x in p) + ")" for p in f.places_mm[:2]) + (" mm" if len(f.places_mm) else ""),
-            f.why, f.mend,
-        )
-        for f in judged.findings
-    ]  # fmt: skip
-    provenance = [(name, text) for name, text in content["versions"].items()]
-    provenance += [(f"input {name}", digest[:16]) for name, digest in content["inputs"].items()]
-    provenance += [(f"time for {stage}", f"{seconds:.1f} s") for stage, seconds in content["seconds"].items()]
-    return report.ReportContent(
-        title="rangecheck report",
-        fit=judged.fit,
-        verdict="bust.stl can be built." if content["stl"] else "No STL was written.",
-        reasons=reasons,
-        sections=[scan_section, map_section],
-        turntables=[report.Turntable(t.material, t.frames) for t in turntables],
-        findings=findings,
+    ring = [trace_maps(shown, camera, orbit.world_from_camera(k), caster) for k in range(len(RING_DEG))]
+    _write_arrays(
+        folder / "maps" / "ring.npz",
+        distance_mm=np.stack([one.distance_mm for one in ring]).astype(np.float32),
+        world_from_camera=np.stack([one.world_from_camera for one in ring]),
+        intrinsics=np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
+        azimuths_deg=np.array(RING_DEG),
+    )
+
+
+def _write_arrays(path: Path, **arrays: Any) -> None:
+    with whole_file(path) as part, part.open("wb") as stream:
+        np.savez_compressed(stream, allow_pickle=False, **arrays)
+
+
+def _read_arrays(path: Path) -> dict[str, Any] | None:
+    """The arrays of an NPZ, None where there is no such file. Raises InputError."""
+    if not path.is_file():
+        return None
+    try:
+        with np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as found:
+            return dict(found)
+    except (OSError, ValueError, EOFError, BadZipFile) as error:
+        raise InputError(path, f"cannot be read ({error}); run the job again with --force") from None
+
+
+def report(folder: str, *, studies: Sequence[str] = (), reporter: Reporter) -> Outcome:
+    """The report of the finished job in `folder`, made again; with `studies`, folders of studies whose charts it shows."""
+    where = Path(folder)
+    if not (where / "run.json").is_file():
+        raise InputError(where, "holds no finished job (no run.json); `rangecheck run` makes one")
+    content = read_json(where / "run.json")
+    with reporter.stage("report"):
+        write_report(page_of(where, content, studies), where / "report.html")
+    size = (where / "report.html").stat().st_size
+    return Outcome(
+        document("report", output=where / "report.html", bytes=size),
+        [f"{where / 'report.html'}: {size / 1e6:.1f} MB, no network"],
+    )
+
+
+def page_of(folder: Path, content: dict[str, Any], studies: Sequence[str | Path] = ()) -> ReportContent:
+    """What the report shows of the job in `folder`, whose run.json holds (or will hold) `content`."""
+    stl, quality = content["stl"], content.get("quality")
+    names = [scan["name"] for scan in content["scans"]]
+    kept = _read_arrays(folder / "likeness.npz")
+    return ReportContent(
+        title=f"Bust from {len(names)} scans" if len(names) != 1 else f"Bust from one scan, {names[0]}",
+        fit=content["fit"],
+        verdict="bust.stl can be built." if stl else "No STL was written: what stands against it is listed under Findings.",
+        reasons=_reasons(content),
+        scans=[_scan(folder, facts, quality) for facts in content["scans"]],
+        worth=_worth(quality),
+        coverage=None if kept is None else _coverage(kept["coverage"], quality),
+        model=None if kept is None else _model(kept),
+        turntables=[
+            Turntable(t["material"], sorted((folder / "frames" / t["material"]).glob("*.png"))) for t in content["turntables"]
+        ],
+        distance_maps=_distance_maps(folder),
+        findings=[
+            Finding(f["code"], f["severity"], f["count"], f["message"], f["why"], f["mend"], np.reshape(f["places_mm"], (-1, 3)))
+            for f in content["verdict"]["findings"]
+        ],
+        charts=[figure for study in studies for figure in _charts(Path(study))],
+        decisions=[*content["decisions"], *(f"{t['material']}: {line}" for t in content["turntables"] for line in t["plan"])],
         settings=json.dumps(content["settings"], indent=1),
-        provenance=provenance,
+        provenance={
+            "Versions": list(content["versions"].items()),
+            "Time": [(stage, f"{seconds:.1f} s") for stage, seconds in content["seconds"].items()],
+            "Inputs, sha256": list(content["inputs"].items()),
+        },
+        files=[(name, about) for name, about in _FILES if (folder / name).exists()],
     )
+
+
+_FILES = (
+    ("bust.stl", "the solid, for the slicer"),
+    ("surface.ply", "the surface, each face labelled measured, interpolated or invented"),
+    ("plaster.mp4", "turntable in plaster"),
+    ("steel.mp4", "turntable in steel"),
+    ("stripes.mp4", "turntable in mirrored stripes"),
+    ("maps", "distance, depth, normals and IDs, full precision"),
+    ("contours", "iso-lines of depth of every scan"),
+    ("run.json", "verdict with places, decisions, versions, input hashes, timings"),
+    ("settings.json", "every setting as it was resolved"),
+)
+
+
+def _reasons(content: dict[str, Any]) -> list[str]:
+    """The three that weigh most: what is wrong comes first, then what the solid is, what was measured of it and how well."""
+    found = content["verdict"]["findings"]
+    shares, quality = content["area_shares"], content.get("quality")
+    reasons = [f["message"] for f in found if f["severity"] == "error"]
+    reasons.append(content["verdict"]["sentence"])
+    reasons.append(", ".join(f"{share:.0%} {name}" for name, share in shares.items()) + " of the surface")
+    if quality:
+        reasons.append(
+            f"the scans are {quality['verdict']} for {quality['profile']['name']}: expected error {quality['expected_error_mm']:.3f} mm, "
+            f"{quality['never_seen']:.1%} of the surface in reach never seen"
+        )
+    reasons.append(f"meshed by {content['method']}: {content['reason']}")
+    return list(dict.fromkeys(reasons))[:3]
+
+
+def _scan(folder: Path, facts: dict[str, Any], quality: dict[str, Any] | None) -> Scan:
+    name = facts["name"]
+    rows = []
+    if facts.get("valid_share") is not None:
+        rows.append(("Readings", f"{facts['valid']:,} ({facts['valid_share']:.0%} of {facts['width']} × {facts['height']})"))
+    else:
+        rows.append(("Readings", f"{facts['valid']:,}"))
+    rows.append(("Distances", f"{facts['nearest_mm']:.1f} to {facts['farthest_mm']:.1f} mm"))
+    if facts.get("spacing_mm"):
+        rows.append(("Spacing", f"{facts['spacing_mm']:.2f} mm"))
+    view = next((v for v in (quality or {}).get("views", ()) if v["name"] == name), None)
+    if view is not None:
+        rows.append(("Noise", f"{view['noise_mm']:.3f} mm"))
+        rows.append(("Grazing", f"{view['grazing']:.0%}"))
+        if view["overlap"] is not None:
+            rows.append(("Confirmed by others", f"{view['overlap']:.0%}"))
+    elif facts.get("noise_mm"):
+        rows.append(("Noise", f"{facts['noise_mm']:.3f} mm"))
+    pictures = [
+        Figure(kind, "", read_bytes(path), alt=f"{kind} of {name}")
+        for kind in ("Brightness", "Contours")
+        if (path := folder / kind.lower() / f"{name}.png").is_file()
+    ]
+    return Scan(name, rows, pictures)
 
 
 def _worth(quality: dict[str, Any] | None) -> list[tuple[str, str]]:
@@ -87,15 +234,90 @@ def _worth(quality: dict[str, Any] | None) -> list[tuple[str, str]]:
     if quality is None:
         return []
     rows = [
-        ("worth", f"{quality['verdict']} for {quality['profile']['name']}"),
-        ("never seen", f"{quality['never_seen']:.1%} of the surface in reach, in {quality['gaps']} gaps"),
-        ("samples", f"{quality['spacing_mm']:.2f} mm apart"),
-        ("expected error", f"{quality['expected_error_mm']:.3f} mm"),
+        ("Worth", f"{quality['verdict']} for {quality['profile']['name']}"),
+        ("Never seen", f"{quality['never_seen']:.1%} of the surface in reach, in {quality['gaps']} gaps"),
+        ("Readings", f"{quality['spacing_mm']:.2f} mm apart"),
+        ("Expected error", f"{quality['expected_error_mm']:.3f} mm"),
     ]
-    rows += [(found["severity"], found["text"]) for found in quality["findings"]]
-    return rows + ([("next view", quality["next_view"]["reason"])] if quality["next_view"] else [])
+    return rows + [(found["severity"].capitalize(), found["text"]) for found in quality["findings"]]
 
 
-def _brightness(scan: RangeScan) -> Any:
-    assert scan.brightness is not None
-    return np.rint(255 * np.nan_to_num(np.clip(scan.brightness, 0, 1))).astype(np.uint8)
+def _coverage(counts: Any, quality: dict[str, Any] | None) -> Coverage:
+    views = [(v["name"], v["azimuth_deg"], v["elevation_deg"]) for v in (quality or {}).get("views", ())]
+    following = (quality or {}).get("next_view")
+    if following is None:
+        return Coverage(counts, views)
+    return Coverage(counts, views, (following["azimuth_deg"], following["elevation_deg"]), following["reason"])
+
+
+def _model(kept: dict[str, Any]) -> Model:
+    surface = Surface(
+        kept["vertices_mm"].astype(np.float64),
+        kept["faces"],
+        kept["part_of_face"],
+        kept["origin_of_face"],
+        tuple(str(name) for name in kept["part_names"]),
+    )
+    off, off_99 = kept["off_mm"]
+    about = f"{len(surface.faces):,} faces"
+    if int(kept["faces_before"]) != len(surface.faces):
+        about = (
+            f"{about} of the bust's {int(kept['faces_before']):,}: 99 % of its points lie within {off_99:.2f} mm of this likeness, "
+            f"all within {off:.2f} mm"
+        )
+    fields = []
+    for key, label, colours in (
+        ("error_mm", "Expected error", "viridis"),
+        ("deviation_mm", "Deviation from the scans", "RdBu_r"),
+        ("thickness_mm", "Wall thickness", "viridis"),
+    ):
+        values = kept[key].astype(np.float64)
+        known = values[np.isfinite(values)]
+        if not len(known):
+            continue
+        if key == "deviation_mm":
+            high = float(np.quantile(np.abs(known), 0.98)) or 1.0
+            low = -high
+            says = f" Half of it within {np.median(np.abs(known)):.3f} mm, 95 % within {np.quantile(np.abs(known), 0.95):.3f} mm."
+        else:
+            low, high = float(known.min()), float(np.quantile(known, 0.98))
+            says = f" From {known.min():.3g} mm; median {np.median(known):.3g} mm."
+        fields.append(Field(key, label, "mm", values, low, max(high, low + 1e-6), _ABOUT[key] + says, colours))
+    return Model(surface, about, fields, kept["flagged"])
+
+
+def _distance_maps(folder: Path) -> list[DistanceMap]:
+    """The maps asked for, then the ring."""
+    found = []
+    for path in sorted((folder / "maps").glob("azimuth_*/maps.npz"), key=lambda p: float(p.parent.name.split("_")[1])):
+        one = read_maps_npz(path)
+        camera = one.camera
+        exact = isinstance(camera, PinholeCamera) and not camera.distortion
+        inner = (camera.fx, camera.fy, camera.cx, camera.cy) if exact and isinstance(camera, PinholeCamera) else None
+        label = f"{float(path.parent.name.split('_')[1]):g}°, {one.distance_mm.shape[1]} px"
+        found.append(DistanceMap(label, one.distance_mm, inner, one.world_from_camera))
+    ring = _read_arrays(folder / "maps" / "ring.npz")
+    if ring is not None:
+        found += [
+            DistanceMap(f"{azimuth:g}°", distance.astype(np.float64), tuple(ring["intrinsics"].tolist()), pose)
+            for azimuth, distance, pose in zip(ring["azimuths_deg"], ring["distance_mm"], ring["world_from_camera"])
+        ]
+    return found
+
+
+def _charts(folder: Path) -> list[Figure]:
+    """The charts of the studies in `folder`, titled as their documents title them."""
+    if not folder.is_dir():
+        raise InputError(folder, "is no folder; give the folder that `rangecheck study` wrote")
+    found = []
+    for path in sorted(folder.rglob("*.json")):
+        study = read_json(path)
+        if not isinstance(study, dict) or study.get("schema") != "rangecheck/study/1":
+            continue
+        for chart in study["charts"]:
+            picture = path.with_name(f"{path.stem}-{chart['slug']}.svg")
+            if picture.is_file():
+                found.append(Figure(chart["title"], study["title"], read_bytes(picture), alt=f"Chart: {chart['title']}"))
+    if not found:
+        raise InputError(folder, "holds no charts; give the folder that `rangecheck study` wrote")
+    return found

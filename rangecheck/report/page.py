@@ -1,108 +1,191 @@
-"""The report: everything it shows is handed to it; it only lays out and embeds.
+"""The report as one HTML file that asks nothing of the network: style, scripts, pictures, mesh and maps are inside it.
 
-The page asks nothing of the network: style, script and pictures are inside it.
+Its Content-Security-Policy allows the scripts and styles that it was written with, by their hashes, and no connection. three.js is embedded as
+it was published (vendor/); the page links its two modules when it is opened.
 """
 
 from __future__ import annotations
 
 import base64
+import hashlib
+import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+from rangecheck.export.legend import colour_table
 from rangecheck.files import read_bytes, write_bytes
+from rangecheck.report.content import DistanceMap, Model, ReportContent, Turntable, data_uri
+from rangecheck.report.pack import octahedral, packed, packed_floats
+from rangecheck.report.sphere import halves, seen_share
+from rangecheck.surface import ORIGIN_NAMES
 
-_MEDIA = {
-    b"\x89PNG": "image/png",
-    b"\xff\xd8\xff": "image/jpeg",
-    b"RIFF": "image/webp",
-    b"<svg": "image/svg+xml",
-    b"<?xm": "image/svg+xml",
-}
-
-
-@dataclass(frozen=True)
-class Figure:
-    """A picture (encoded bytes: PNG, JPEG, WebP or SVG) with what it shows."""
-
-    title: str
-    caption: str
-    picture: bytes = field(repr=False)
-
-    @property
-    def source(self) -> str:
-        """The picture as a data URI."""
-        kind = next((media for start, media in _MEDIA.items() if self.picture.startswith(start)), "image/png")
-        return f"data:{kind};base64,{base64.b64encode(self.picture).decode()}"
+#: bytes that all frames together may take in the page
+FRAME_BUDGET = 4_500_000
+_QUALITIES = (88, 80, 70)
+_STOPS = 33
+_SCRIPTS = ("shared.js", "turn.js", "controls.js", "viewer.js", "maps.js")
+_LIBRARY = ("three.core.min.js", "three.module.min.js")
 
 
-@dataclass(frozen=True)
-class Turntable:
-    """Frames of one material over the same orbit."""
-
-    name: str
-    frames: Sequence[Path]
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One row of the findings table."""
-
-    code: str
-    severity: str
-    count: int
-    message: str
-    place: str
-    why: str
-    mend: str
-
-
-@dataclass(frozen=True)
-class Section:
-    """A heading with facts (label, value) and figures below it."""
-
-    title: str
-    text: str = ""
-    facts: Sequence[tuple[str, str]] = ()
-    figures: Sequence[Figure] = ()
-
-
-@dataclass(frozen=True)
-class ReportContent:
-    """Everything the report shows."""
-
-    title: str
-    fit: bool
-    verdict: str
-    reasons: Sequence[str]
-    sections: Sequence[Section]
-    turntables: Sequence[Turntable]
-    findings: Sequence[Finding]
-    settings: str
-    provenance: Sequence[tuple[str, str]]
-
-
-def _frame(path: Path, quality: int) -> Figure:
-    """A frame made small: JPEG at `quality`."""
-    import cv2
-    import numpy as np
-
-    picture = cv2.imdecode(np.frombuffer(read_bytes(path), np.uint8), cv2.IMREAD_COLOR)
-    _, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return Figure(path.stem, "", encoded.tobytes())
-
-
-def write_report(content: ReportContent, path: str | Path, *, frame_quality: int = 85, force: bool = True) -> None:
+def write_report(content: ReportContent, path: str | Path, *, force: bool = True) -> None:
     """Write the report as one HTML file at `path`."""
+    write_bytes(path, report_html(content).encode(), force=force)
+
+
+def report_html(content: ReportContent) -> str:
+    """The page."""
     import jinja2
 
     room = resources.files("rangecheck.report")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    page = environment.from_string((room / "page.html.j2").read_text("utf-8")).render(
+    style = (room / "page.css").read_text("utf-8")
+    script = "\n".join((room / name).read_text("utf-8") for name in _SCRIPTS)
+    tables, frames_note = _turntables(content.turntables)
+    data: dict[str, Any] = {"tables": tables, "colours": _colours(content)}
+    data["maps"] = [_map_form(one) for one in content.distance_maps]
+    data["findings"] = [
+        {"code": f.code, "severity": f.severity, "places": np.round(f.places_mm, 3).tolist()} for f in content.findings
+    ]
+    if content.model is not None:
+        data["model"] = _model_form(content.model)
+        data["library"] = [_deflated((room / "vendor" / name).read_bytes()) for name in _LIBRARY]
+    return environment.from_string((room / "page.html.j2").read_text("utf-8")).render(
         content=content,
-        turntables=[(table.name, [_frame(f, frame_quality).source for f in table.frames]) for table in content.turntables],
-        style=(room / "page.css").read_text("utf-8"),
-        script=(room / "page.js").read_text("utf-8"),
+        data=data,
+        frames_note=frames_note,
+        sphere=None if content.coverage is None else halves(content.coverage),
+        seen=None if content.coverage is None else seen_share(content.coverage.counts),
+        data_uri=data_uri,
+        style=style,
+        script=script,
+        policy=(
+            f"default-src 'none'; script-src 'sha256-{_digest(script)}' blob:; style-src 'sha256-{_digest(style)}'; "
+            "img-src data: blob:; base-uri 'none'; form-action 'none'"
+        ),
     )
-    write_bytes(path, page.encode(), force=force)
+
+
+def _digest(text: str) -> str:
+    return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+
+
+def _deflated(content: bytes) -> str:
+    return base64.b64encode(zlib.compress(content, 9)).decode()
+
+
+def _colours(content: ReportContent) -> dict[str, list[list[int]]]:
+    """The colour tables that the page uses, at evenly spaced stops."""
+    names = {"viridis"} | ({f.colours for f in content.model.fields} if content.model else set())
+    at = np.linspace(0, 255, _STOPS).round().astype(int)
+    return {name: np.rint(255 * colour_table(name)[at]).astype(int).tolist() for name in sorted(names)}
+
+
+def _turntables(tables: Sequence[Turntable]) -> tuple[list[dict[str, Any]], str]:
+    """Names and frames as data URIs within the budget, and how many of how many frames, at what quality."""
+    if not tables:
+        return [], ""
+    every = 1
+    while True:
+        for quality in _QUALITIES:
+            shown = [[_jpeg(path, quality) for path in table.frames[::every]] for table in tables]
+            size = sum(len(frame) for frames in shown for frame in frames)
+            if size * 4 / 3 <= FRAME_BUDGET:
+                total, count = sum(len(table.frames) for table in tables), sum(len(frames) for frames in shown)
+                note = f"{count} of {total} frames are in this file, as JPEG of quality {quality}"
+                forms = [
+                    {"name": table.name, "step": 360 * every / len(table.frames), "frames": [data_uri(f) for f in frames]}
+                    for table, frames in zip(tables, shown)
+                ]
+                return forms, note
+        every += 1
+
+
+def _jpeg(path: Path, quality: int) -> bytes:
+    import cv2
+
+    picture = cv2.imdecode(np.frombuffer(read_bytes(path), np.uint8), cv2.IMREAD_COLOR)
+    _, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return encoded.tobytes()
+
+
+def _map_form(one: DistanceMap) -> dict[str, Any]:
+    height, width = one.distance_mm.shape
+    return {
+        "label": one.label,
+        "width": width,
+        "height": height,
+        "distance": packed_floats(np.asarray(one.distance_mm, np.float64).reshape(-1)),
+        "intrinsics": one.intrinsics,
+        "pose": np.asarray(one.world_from_camera, np.float64).tolist(),
+    }
+
+
+def _model_form(model: Model) -> dict[str, Any]:
+    """The mesh with its vertices in the order of a curve through space, so that neighbours stand beside each other; vertices at which faces
+    of different origin or part meet are taken once for each."""
+    surface = model.surface
+    corner_key = np.stack(
+        [surface.faces.reshape(-1), np.repeat(surface.part_of_face, 3), np.repeat(surface.origin_of_face, 3)], axis=1
+    ).astype(np.int64)
+    keys, corners = np.unique(corner_key, axis=0, return_inverse=True)
+    vertex, origin = keys[:, 0], keys[:, 2].astype(np.uint8)
+    normals = _normals(model, keys)
+    order = np.argsort(_curve(surface.vertices[vertex]), kind="stable")
+    place = np.empty(len(order), np.int64)
+    place[order] = np.arange(len(order))
+    faces = place[corners.reshape(-1, 3)].astype(np.uint32)
+    faces = np.take_along_axis(faces, (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
+    faces = faces[np.lexsort(faces.T[::-1])]
+    vertex, origin = vertex[order], origin[order]
+    low, high = surface.bounds_mm
+    step = float((high - low).max()) / 65535 or 1.0
+    return {
+        "about": model.about,
+        "low": low.tolist(),
+        "high": high.tolist(),
+        "step": step,
+        "positions": packed(np.rint((surface.vertices[vertex] - low) / step).astype(np.uint16)),
+        "normals": packed(octahedral(normals[order])),
+        "faces": packed(faces),
+        "origins": list(ORIGIN_NAMES),
+        "origin": packed(origin),
+        "flagged": None if model.flagged is None else packed(model.flagged[vertex].astype(np.uint8)),
+        "fields": [
+            {
+                "key": f.key, "label": f.label, "unit": f.unit, "about": f.about, "colours": f.colours,
+                "from": f.low, "to": f.high, "values": packed_floats(f.values[vertex]),
+            }
+            for f in model.fields
+        ],
+    }  # fmt: skip
+
+
+def _normals(model: Model, keys: Any) -> Any:
+    """(k, 3) unit normals of the vertices in `keys` (vertex, part, origin), smooth within a part and sharp between parts."""
+    surface = model.surface
+    pairs, of_corner = np.unique(
+        np.stack([surface.faces.reshape(-1).astype(np.int64), np.repeat(surface.part_of_face, 3)], axis=1),
+        axis=0,
+        return_inverse=True,
+    )
+    of_corner = of_corner.reshape(-1)
+    area = np.repeat(surface.area_vectors, 3, axis=0)
+    total = np.stack([np.bincount(of_corner, area[:, axis], minlength=len(pairs)) for axis in range(3)], axis=1)
+    total = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
+    stride = int(keys[:, 1].max(initial=0)) + 1
+    return total[np.searchsorted(pairs[:, 0] * stride + pairs[:, 1], keys[:, 0] * stride + keys[:, 1])]
+
+
+def _curve(points: Any) -> Any:
+    """(n,) places of points along a Morton curve with 2^10 cells a side."""
+    low = points.min(axis=0)
+    cell = np.minimum((points - low) * (1023.0 / (float(np.ptp(points, axis=0).max()) or 1.0)), 1023.0).astype(np.uint64)
+    code = np.zeros(len(points), np.uint64)
+    for bit in range(10):
+        for axis in range(3):
+            code |= ((cell[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
+    return code
