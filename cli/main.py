@@ -22,6 +22,7 @@ COMMANDS = {
     "render": "Make one picture of a mesh, scan or scene.",
     "maps": "Distance, depth, normals and surface IDs from any focal point.",
     "turntable": "Frames and video of an orbit; resumes where it was stopped.",
+    "dataset": "Many pictures with their truth over sampled parameters, for vision research.",
     "simulate": "Make the scans that a range finder would have measured of a mesh.",
     "decode": "Turn structured-light pictures into a range scan.",
     "draw": "Line drawing of a modelled scene, hidden lines removed.",

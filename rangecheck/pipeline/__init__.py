@@ -12,6 +12,7 @@ from rangecheck.pipeline.outcome import Outcome
 
 _WHERE = {
     "check": "inspect",
+    "dataset": "dataset",
     "decode": "captures",
     "doctor": "health",
     "draw": "views",
