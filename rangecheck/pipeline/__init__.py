@@ -12,7 +12,7 @@ from rangecheck.pipeline.outcome import Outcome
 
 _WHERE = {
     "check": "inspect",
-    "dataset": "dataset",
+    "dataset": "vision",
     "decode": "captures",
     "doctor": "health",
     "draw": "views",

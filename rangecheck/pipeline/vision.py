@@ -61,7 +61,7 @@ def pictures_of(job: Job) -> Callable[[int], tuple[Made, list[str]]]:
 def _pixels(png: bytes) -> Any:
     import cv2
 
-    picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
+    picture: Any = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
     return picture if picture.ndim == 2 else picture[..., ::-1]
 
 
