@@ -47,7 +47,8 @@ def regions(part_id: Any, names: Sequence[str]) -> list[dict[str, Any]]:
 
 def masks_document(rows: Sequence[dict[str, Any]], names: Sequence[str]) -> dict[str, Any]:
     """The pictures and masks of an index in the form of a COCO annotation file."""
-    images, annotations = [], []
+    images: list[dict[str, Any]] = []
+    annotations: list[dict[str, Any]] = []
     for row in rows:
         images.append({"id": row["index"], "file_name": row["picture"], "width": row["width"], "height": row["height"]})
         for region in row["regions"]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from rangecheck.arrays import FloatArray
 from rangecheck.config import Settings
 from rangecheck.errors import PosesRefused
 from rangecheck.export.map_files import write_maps
@@ -56,7 +57,9 @@ def run(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None,
         judged = _with_scan_findings(judged, shown, settings)
         write_mesh(shown, folder / "surface.ply")
 
-        orbit = orbit_of(shown, settings)
+        front = _front_deg(shown, eye_of(ready.scans), reporter)
+        turn = settings.turntable.model_copy(update={"start_deg": settings.turntable.start_deg + front})
+        orbit = orbit_of(shown, settings.model_copy(update={"turntable": turn}))
         turntables = [
             render_turntable(
                 shown, name, orbit, folder / f"{name}.mp4", folder / "frames" / name, settings, reporter, force=force
@@ -66,7 +69,7 @@ def run(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None,
         with reporter.stage("contours"):
             for scan in read:
                 write_bytes(folder / "contours" / f"{scan.name}.png", png_bytes(contours_of(scan, settings)))
-        _distance_maps(shown, folder, settings, reporter)
+        _distance_maps(shown, folder, settings, front, reporter)
 
         stl: dict[str, Any] | None = None
         (folder / "bust.stl").unlink(missing_ok=True)
@@ -127,9 +130,19 @@ def _with_scan_findings(judged: Verdict, shown: Surface, settings: Settings) -> 
     return verdict(found, facts)
 
 
-def _distance_maps(shown: Surface, folder: Path, settings: Settings, reporter: Reporter) -> None:
+def _front_deg(shown: Surface, eye_mm: FloatArray | None, reporter: Reporter) -> float:
+    """Azimuth that turntable and maps count from: where a single scan was taken from, else that of the world."""
+    if eye_mm is None:
+        return 0.0
+    away = eye_mm - shown.bounds_mm.mean(axis=0)
+    front = float(np.round(np.degrees(np.arctan2(away[0], away[2]))))
+    reporter.note(f"the scanner's side, azimuth {front:g} degrees, counts as the front")
+    return front
+
+
+def _distance_maps(shown: Surface, folder: Path, settings: Settings, front_deg: float, reporter: Reporter) -> None:
     with reporter.stage("distance maps", len(settings.maps.azimuths_deg)):
         for index, azimuth in enumerate(settings.maps.azimuths_deg):
-            measured, where = map_at(shown, settings, azimuth)
+            measured, where = map_at(shown, settings, front_deg + azimuth)
             write_maps(folder / "maps" / f"azimuth_{azimuth:g}", measured, subtitle=where)
             reporter.advance(index + 1)
