@@ -28,6 +28,8 @@ from rangecheck.surface.surface import INVENTED, Surface
 #: gaps up to this many typical edges wide are bridged at the outer rim, and wider ones where pieces would else fall apart: up to this
 #: share of the relief's extent
 GAP_EDGES, GAP_SHARE = 6.0, 0.1
+#: gaps bridged to join pieces are this many times as wide as the narrowest that joins them
+BRIDGE = 3.0
 #: pieces with less than this share of the largest one's area in (u, v) are dropped
 ISLAND_SHARE = 0.02
 
@@ -87,7 +89,7 @@ def close_relief(
     """A solid whose front is `surface` and whose back is a plane `back_mm` behind its deepest point.
 
     eye_mm       (3,) where the scan was taken from; None means parallel rays against the mean normal
-    gap_mm       width up to which gaps of the outer rim are bridged; None means GAP_EDGES typical edges, or what keeps the pieces together,
+    gap_mm       width up to which gaps of the outer rim are bridged; None means GAP_EDGES typical edges, or BRIDGE times what joins the pieces,
                  but at most GAP_SHARE of the extent. Inner holes are all filled
     island_share pieces below this share of the largest one's area are dropped
 
@@ -219,11 +221,13 @@ def _gap_that_joins(uv: FloatArray, faces: IntArray, least_mm: float, notes: lis
         met = np.unique(group[pieces[triangle]])
         group[np.isin(group, met)] = met[0]
         if (group == group[0]).all():
-            needed = float(longest[triangle]) * (1 + 1e-9)
             widest = GAP_SHARE * float(np.ptp(uv[faces].reshape(-1, 2), axis=0).max())
-            if least_mm < needed <= widest:
+            narrowest = float(longest[triangle])
+            # a bridge over the narrowest place alone would be a thread
+            needed = min(BRIDGE * narrowest, widest)
+            if least_mm < needed and narrowest < widest:
                 notes.append(
-                    f"{count} pieces lie apart by up to {needed:.1f} mm; gaps that wide were bridged, so that they hang together"
+                    f"{count} pieces lie {narrowest:.1f} mm apart at the narrowest; gaps of up to {needed:.1f} mm were bridged, so that they hang together"
                 )
                 return needed
             break
