@@ -1,0 +1,219 @@
+"""What each pixel of a photograph sees of a known shape: place, normal, direction to the camera, footprint, and how they move with the pose.
+
+World frame, millimetres. The pose's six numbers are a small turn (rad) about the camera's middle and a small shift (mm) of it, both in
+world axes; the triangle that a pixel sees is held. On it the normal changes as the corners' normals are interpolated, so that the
+derivatives are exact for what is drawn.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from rangecheck import rigid
+from rangecheck.arrays import BoolArray, FloatArray, IntArray, require
+from rangecheck.errors import SceneError
+from rangecheck.kernels import in_chunks
+from rangecheck.optics import Camera
+from rangecheck.raycast import EmbreeCaster
+from rangecheck.recover.lights import Light
+from rangecheck.scene import Scene
+
+POSE_NUMBERS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """n pixels that see the shape.
+
+    pixel       (n,) index into the flattened picture (row by row)
+    face        (n,) int32 the triangle seen
+    points      (n, 3) mm;  normals, facing (n, 3) unit, shading and the triangle's own, turned to the camera
+    views       (n, 3) unit, to the camera
+    footprints  (n,) angular radius, rad, of the disc as large as what the pixel mirrors; 0 where it is not known
+    spans_mm    (n,) size of the pixel on the surface, across the view
+    by_pose     (n, 3, 3, 6): derivative of point, normal, view by the camera's turn and shift
+    shape       (height, width) of the picture
+    """
+
+    pixel: IntArray
+    face: IntArray
+    points: FloatArray
+    normals: FloatArray
+    facing: FloatArray
+    views: FloatArray
+    footprints: FloatArray
+    spans_mm: FloatArray
+    by_pose: FloatArray
+    shape: tuple[int, int]
+
+    def __len__(self) -> int:
+        return len(self.pixel)
+
+    def only(self, keep: IntArray | BoolArray) -> Sight:
+        """The pixels chosen by index or mask."""
+        chosen = {item.name: getattr(self, item.name)[keep] for item in fields(self) if item.name != "shape"}
+        return Sight(**chosen, shape=self.shape)
+
+    def spread(self, values: FloatArray, fill: float = np.nan) -> FloatArray:
+        """Values (n, ...) put back into a picture (h, w, ...), `fill` where nothing is seen."""
+        picture = np.full((self.shape[0] * self.shape[1], *values.shape[1:]), fill)
+        picture[self.pixel] = values
+        return picture.reshape(*self.shape, *values.shape[1:])
+
+
+def see(scene: Scene, camera: Camera, world_from_camera: FloatArray, caster: EmbreeCaster | None = None, step: int = 1) -> Sight:
+    """What the middles of every `step`-th row and column of pixels see. Raises SceneError where they see nothing."""
+    pose = rigid.checked(world_from_camera, "world_from_camera")
+    caster = caster or EmbreeCaster(scene.surface.vertices, scene.surface.faces)
+    rows, columns = np.arange(0, camera.height, step), np.arange(0, camera.width, step)
+    u, v = np.meshgrid(columns.astype(float), rows.astype(float))
+    from_camera, along = camera.rays(u, v)
+    origins = rigid.move_points(pose, from_camera).reshape(-1, 3)
+    rays = rigid.move_directions(pose, along).reshape(-1, 3)
+    known = np.asarray(np.isfinite(rays).all(axis=1) & np.isfinite(origins).all(axis=1))
+    face, distance = _cast(caster, origins, np.where(known[:, None], rays, [0.0, 0.0, 1.0]))
+    seen = np.flatnonzero((face >= 0) & known)
+    if not len(seen):
+        raise SceneError("the camera sees nothing of the surface; check the pose and the units")
+    hit = face[seen]
+    triangles = scene.surface.triangles[hit]
+    corner_normals = scene.corner_normals[hit].astype(np.float64)
+    points = origins[seen] + distance[seen, None] * rays[seen]
+    facing = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    twice_area = np.linalg.norm(facing, axis=1)
+    facing = facing / twice_area[:, None]
+    # weights of the corners change across the triangle by these
+    slopes = np.stack([np.cross(facing, triangles[:, (k + 2) % 3] - triangles[:, (k + 1) % 3]) for k in range(3)], axis=1)
+    slopes /= twice_area[:, None, None]
+    # in double precision, which the caster's own weights are not
+    weight = 1.0 + np.einsum("nkx,nkx->nk", slopes, points[:, None, :] - triangles)
+    mixed = np.einsum("nk,nkj->nj", weight, corner_normals)
+    length = np.linalg.norm(mixed, axis=1)
+    turned = np.einsum("nkj,nkx->njx", corner_normals, slopes)
+    normals = mixed / length[:, None]
+    by_place = (turned - normals[:, :, None] * np.einsum("nj,njx->nx", normals, turned)[:, None, :]) / length[:, None, None]
+    back = (facing * rays[seen]).sum(1) > 0.0
+    facing[back] *= -1.0
+    opposed = (normals * facing).sum(1) < 0.0
+    normals[opposed] *= -1.0
+    by_place[opposed] *= -1.0
+    h, w = len(rows), len(columns)
+    spans, footprints = _footprints(points, normals, rays[seen], hit, seen, (h, w))
+    pixel = (rows[seen // w] * camera.width + columns[seen % w]).astype(np.int64)
+    by_pose = _by_pose(points, facing, by_place, origins[seen], rays[seen], pose[:3, 3])
+    return Sight(
+        pixel, hit, points, normals, facing, -rays[seen], footprints / step, spans / step, by_pose, (camera.height, camera.width)
+    )
+
+
+def _cast(caster: EmbreeCaster, origins: FloatArray, rays: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Face (-1 where missed) and distance, ray by ray."""
+    n = len(origins)
+    face, distance = np.empty(n, np.int32), np.empty(n)
+
+    def work(start: int, stop: int) -> None:
+        found = caster.closest(origins[start:stop], rays[start:stop], coherent=True)
+        face[start:stop], distance[start:stop] = found.face, found.distance_mm
+
+    in_chunks(work, n, 16384)
+    return face, distance
+
+
+def _footprints(
+    points: FloatArray, normals: FloatArray, rays: FloatArray, face: IntArray, seen: IntArray, shape: tuple[int, int]
+) -> tuple[FloatArray, FloatArray]:
+    """Sizes of the pixels across the view, mm, and angular radii of the discs that they mirror, from their neighbours."""
+    mirrored = rays - 2.0 * (rays * normals).sum(1)[:, None] * normals
+    flat = np.full((shape[0] * shape[1], 6), np.nan)
+    flat[seen, :3], flat[seen, 3:] = points, mirrored
+    grid = flat.reshape(*shape, 6)
+    with np.errstate(invalid="ignore"):
+        right, down = _differences(grid, 1).reshape(-1, 6)[seen], _differences(grid, 0).reshape(-1, 6)[seen]
+    across = [d[:, :3] - (d[:, :3] * rays).sum(1)[:, None] * rays for d in (right, down)]
+    spans = np.sqrt(np.linalg.norm(np.cross(*across), axis=1))
+    solid_angle = np.linalg.norm(np.cross(right[:, 3:], down[:, 3:]), axis=1)
+    # facets of one normal mirror parallel rays in parallel: there the footprint is next to nothing, but not nothing
+    return np.nan_to_num(spans), np.nan_to_num(np.sqrt(np.maximum(solid_angle, 1e-12) / np.pi))
+
+
+def _differences(grid: FloatArray, axis: int) -> FloatArray:
+    """Central differences along an axis, one-sided where only one neighbour is seen."""
+    ahead, behind = np.full_like(grid, np.nan), np.full_like(grid, np.nan)
+    low = [slice(None)] * 3
+    high = [slice(None)] * 3
+    low[axis], high[axis] = slice(None, -1), slice(1, None)
+    step = grid[tuple(high)] - grid[tuple(low)]
+    ahead[tuple(low)], behind[tuple(high)] = step, step
+    both = 0.5 * (ahead + behind)
+    return np.where(np.isnan(both), np.where(np.isnan(ahead), behind, ahead), both)
+
+
+def _by_pose(
+    points: FloatArray, facing: FloatArray, by_place: FloatArray, origins: FloatArray, rays: FloatArray, eye: FloatArray
+) -> FloatArray:
+    """(n, 3, 3, 6): how point, normal and view move when the camera is turned about its middle, then shifted."""
+    n = len(points)
+    result = np.zeros((n, 3, 3, POSE_NUMBERS))
+    distance = ((points - origins) * rays).sum(1)
+    against = (facing * rays).sum(1)
+    for k in range(POSE_NUMBERS):
+        if k < 3:
+            axis = np.eye(3)[k]
+            turned, shifted = np.cross(axis, rays), np.cross(axis, origins - eye)
+        else:
+            turned, shifted = np.zeros_like(rays), np.broadcast_to(np.eye(3)[k - 3], rays.shape)
+        moved = shifted + distance[:, None] * turned
+        slide = -(facing * moved).sum(1) / against
+        moved = moved + slide[:, None] * rays
+        result[:, 0, :, k] = moved
+        result[:, 1, :, k] = np.einsum("njx,nx->nj", by_place, moved)
+        result[:, 2, :, k] = -turned
+    return result
+
+
+def lit_by(sight: Sight, lights: tuple[Light, ...], caster: EmbreeCaster) -> BoolArray:
+    """(n, s) whether nothing lies between each point and each light's middle, the horizon left to the form factor."""
+    lit = np.zeros((len(sight), len(lights)), bool)
+    start = sight.points + caster.skin_mm * sight.facing
+    for s, light in enumerate(lights):
+        towards = light.centre_mm - start
+        distance = np.linalg.norm(towards, axis=1)
+        directions = np.ascontiguousarray(towards / distance[:, None])
+        reach = distance - light.radius_mm
+
+        def work(first: int, stop: int, s: int = s, directions: FloatArray = directions, reach: FloatArray = reach) -> None:
+            lit[first:stop, s] = ~caster.occluded(start[first:stop], directions[first:stop], reach[first:stop], coherent=True)
+
+        in_chunks(work, len(sight), 16384)
+        # a triangle that turns away is dark, but the rounded surface it stands for may not be
+        lit[:, s] |= (sight.facing * directions).sum(1) <= 0.0
+    return lit
+
+
+def sphere_sight(centre_px: tuple[float, float], radius_px: float, shape: tuple[int, int], margin_px: float = 2.0) -> Sight:
+    """A sphere of known outline under parallel view: x right, y up, z to the camera, one millimetre a pixel, the sphere's middle at the origin.
+
+    `margin_px` at its rim is left out. Raises SceneError when the outline does not meet the picture."""
+    middle = require("centre_px", centre_px, (2,), finite=True)
+    if not (np.isfinite(radius_px) and radius_px > margin_px):
+        raise SceneError(f"the sphere's radius is {radius_px} px; it must be above the margin of {margin_px} px")
+    rows, columns = np.indices(shape)
+    x, y = (columns - middle[0]).ravel() / radius_px, (middle[1] - rows).ravel() / radius_px
+    pixel = np.flatnonzero(np.hypot(x, y) < 1.0 - margin_px / radius_px)
+    if not len(pixel):
+        raise SceneError(
+            f"no pixel of the picture {shape[::-1]} lies inside the sphere at {tuple(middle)} px, radius {radius_px} px"
+        )
+    x, y = x[pixel], y[pixel]
+    normals = np.stack([x, y, np.sqrt(1.0 - x * x - y * y)], axis=1)
+    views = np.tile([0.0, 0.0, 1.0], (len(pixel), 1))
+    points = radius_px * normals
+    n = len(pixel)
+    # a mirror ball spreads what it shows: the solid angle of mirrored directions is 4 times the disc's area over R^2
+    footprints = np.full(n, 2.0 / radius_px / np.sqrt(np.pi))
+    by_place = np.broadcast_to(np.eye(3) / radius_px, (n, 3, 3)) - normals[:, :, None] * normals[:, None, :] / radius_px
+    origins = points + 1000.0 * views
+    by_pose = _by_pose(points, normals, by_place, origins, -views, np.array([0.0, 0.0, 1000.0]))
+    return Sight(pixel, np.zeros(n, np.int32), points, normals, normals.copy(), views, footprints, np.ones(n), by_pose, shape)
