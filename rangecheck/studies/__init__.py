@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 #: every study by name, and the module whose `study(quick, part)` makes it
 STUDIES = {
     "reflectance": "rangecheck.studies.reflectance",
+    "transport": "rangecheck.studies.transport",
 }
 
 
