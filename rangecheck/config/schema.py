@@ -48,6 +48,9 @@ class Meshing(Section):
         "auto", description="how scans become triangles; auto chooses and says why"
     )
     voxel_mm: Positive | None = Field(None, description="edge of a fusion cell; without it, from the scans' own sample spacing")
+    voxel_in_spacings: Annotated[float, Field(ge=0.25, le=8)] = Field(
+        1.0, description="that cell where voxel_mm is not given, in medians of the distance between neighbouring samples"
+    )
     max_angle_deg: Annotated[float, Field(gt=0, lt=90)] = Field(
         80.0,
         description="a grid triangle whose normal leans further than this from the line of sight is a depth jump and is left out",

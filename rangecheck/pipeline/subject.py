@@ -100,6 +100,7 @@ def surface_of(scans: Sequence[Measured], settings: Settings, reporter: Reporter
             scans,
             method,
             voxel_mm=wanted.voxel_mm,
+            voxel_in_spacings=wanted.voxel_in_spacings,
             max_angle_deg=wanted.max_angle_deg,
             closing=wanted.closing,
             largest_hole_mm=wanted.largest_hole_mm,

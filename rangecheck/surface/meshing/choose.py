@@ -28,10 +28,9 @@ def _grid(
 _BY_NAME: dict[str, Callable[..., Surface]] = {"grid": _grid, "fuse": fuse, "poisson": poisson, "pivot": pivot}
 METHODS = ("auto", *_BY_NAME)
 #: settings that some methods have no use for
-_ONLY_GRID, _NOT_GRID = (
-    ("max_angle_deg", "noise_mm"),
-    ("voxel_mm", "measured_mm", "interpolated_mm", "closing", "largest_hole_mm"),
-)
+_ONLY_GRID = ("max_angle_deg", "noise_mm")
+_NOT_GRID = ("voxel_mm", "measured_mm", "interpolated_mm", "closing", "largest_hole_mm")
+_ONLY_FUSE = ("voxel_in_spacings",)
 
 
 def choose_method(scans: Sequence[RangeScan | PointCloud]) -> tuple[str, str]:
@@ -55,13 +54,13 @@ def mesh_scans(scans: Sequence[RangeScan | PointCloud], method: str = "auto", **
     """One surface from the scans by `method`: auto, grid (one scan), fuse, poisson or pivot.
 
     settings  those of the method; None means its default; those that only other methods know (max_angle_deg and noise_mm: grid; voxel_mm,
-              measured_mm, interpolated_mm, closing, largest_hole_mm: all but grid) are left aside
+              measured_mm, interpolated_mm, closing, largest_hole_mm: all but grid; voxel_in_spacings: fuse) are left aside
     Raises SettingError for an unknown method or setting, and what the method raises."""
     if method not in METHODS:
         raise SettingError(f"meshing method is {method!r}; it must be one of {', '.join(METHODS)}", key="meshing.method")
     if method == "auto":
         method, _ = choose_method(scans)
-    aside = _NOT_GRID if method == "grid" else _ONLY_GRID
+    aside = (_NOT_GRID if method == "grid" else _ONLY_GRID) + (() if method == "fuse" else _ONLY_FUSE)
     given = {name: value for name, value in settings.items() if value is not None and name not in aside}
     try:
         return _BY_NAME[method](scans, **given)

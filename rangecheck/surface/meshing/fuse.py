@@ -42,6 +42,7 @@ def fuse(
     scans: Sequence[RangeScan],
     *,
     voxel_mm: float | None = None,
+    voxel_in_spacings: float = VOXEL_IN_SPACINGS,
     measured_mm: float | None = None,
     interpolated_mm: float | None = None,
     closing: str = "closed",
@@ -50,7 +51,7 @@ def fuse(
 ) -> Surface:
     """One outward-oriented 2-manifold from posed scans, closed unless `closing` says otherwise.
 
-    voxel_mm         step of the grid; by default VOXEL_IN_SPACINGS times the median distance between neighbouring samples
+    voxel_mm         step of the grid; by default `voxel_in_spacings` times the median distance between neighbouring samples
     measured_mm      a face with a sample this near to its centroid is measured (default 2 sample spacings)
     interpolated_mm  one with a sample this near is interpolated (default 6 spacings); the rest is invented
     closing          closed; half: invented patches wider than `largest_hole_mm` are left open; open: all are
@@ -59,8 +60,10 @@ def fuse(
     Raises ScanError for scans without a surface or cameras that cannot be projected into, SettingError for a bad setting."""
     if voxel_mm is not None and not (np.isfinite(voxel_mm) and voxel_mm > 0):
         raise SettingError(f"voxel_mm is {voxel_mm}; it must be a positive number of millimetres", key="voxel_mm")
+    if not (np.isfinite(voxel_in_spacings) and voxel_in_spacings > 0):
+        raise SettingError(f"voxel_in_spacings is {voxel_in_spacings}; it must be a positive number", key="voxel_in_spacings")
     views = views_of(scans)
-    step = voxel_mm or VOXEL_IN_SPACINGS * views.spacing_mm
+    step = voxel_mm or voxel_in_spacings * views.spacing_mm
     measured, interpolated = thresholds(views.spacing_mm, measured_mm, interpolated_mm)
     grid, coarse = _grid_of_distances(views, step)
     points, normals, low, seen, quads = zero_set(grid, coarse)
