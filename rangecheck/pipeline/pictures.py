@@ -69,7 +69,7 @@ def _direct_plan(scene: Scene, samples: int) -> Plan:
         + ("one reflection in mirrors" if mirrors else "no interreflection")
         + "; light.model=plan follows as much light as a tolerance asks for",
     )
-    return Plan("direct", 0.0, followed, None, grey, reasons)
+    return Plan("direct", 0.0, followed, None, grey, reasons=reasons)
 
 
 def render(
