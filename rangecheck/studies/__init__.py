@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -14,15 +14,20 @@ if TYPE_CHECKING:
 
 #: every study by name, and the module whose `study(quick, part)` makes it
 STUDIES = {
+    "fit": "rangecheck.studies.fit",
+    "pictures": "rangecheck.studies.pictures",
+    "meshing": "rangecheck.studies.meshing",
     "reflectance": "rangecheck.studies.reflectance",
     "transport": "rangecheck.studies.transport",
+    "renderers": "rangecheck.studies.renderers",
 }
 
 
-def study_named(name: str, part: str | None = None) -> Callable[..., Study]:
-    """The function `study(quick=False) -> Study` of that name, or of one of its parts. Raises SettingError naming those that exist."""
+def study_named(name: str, part: str | None = None, others: Sequence[str] = ()) -> Callable[..., Study]:
+    """The function `study(quick=False) -> Study` of that name, or of one of its parts. Raises SettingError naming those that exist, here
+    and among `others`, which the caller knows."""
     if name not in STUDIES:
-        raise SettingError(f"there is no study {name!r}; choose one of {', '.join(STUDIES)}", key=name)
+        raise SettingError(f"there is no study {name!r}; choose one of {', '.join([*STUDIES, *others])}", key=name)
     module = importlib.import_module(STUDIES[name])
     if part is None:
         made: Callable[..., Study] = module.study
