@@ -22,9 +22,9 @@ from rangecheck.surface.coarse import clustered
 from rangecheck.surface.distance import SurfaceDistance
 
 #: faces that a page can hold
-MOST_FACES = 120_000
+MOST_FACES = 220_000
 #: the first tolerance, as a share of the extent
-_FIRST = 1 / 2000
+_FIRST = 1 / 3600
 #: samples of the scans that are compared with the surface
 _MOST_SAMPLES = 300_000
 #: directions of the coverage sphere: rows of elevation, columns of azimuth

@@ -46,10 +46,12 @@ from rangecheck.surface import Surface
 #: focal points of the ring, and the longer side of their maps in pixels
 RING_DEG = tuple(float(a) for a in range(0, 360, 30))
 RING_PX = 240
+#: walls thicker than this share of the extent have one colour
+THICK = 1 / 20
 _ABOUT = {
     "error_mm": "Expected standard error of the surface along its normal, from the noise and number of the readings behind it. Grey: nothing was measured.",
     "deviation_mm": "Mean signed distance of the scans' readings nearest to each point, positive outside. Grey: no reading lies there.",
-    "thickness_mm": "Straight inwards to the opposite side, the least around each point. Grey: no side faces it there.",
+    "thickness_mm": "Straight inwards to the opposite side, the least around each point; thicker than the scale is as its end. Grey: no side faces it there.",
 }
 
 
@@ -152,6 +154,7 @@ def page_of(folder: Path, content: dict[str, Any], studies: Sequence[str | Path]
         reasons=_reasons(content),
         scans=[_scan(folder, facts, quality) for facts in content["scans"]],
         worth=_worth(quality),
+        remarks=[(found["severity"], found["text"]) for found in (quality or {}).get("findings", ())],
         coverage=None if kept is None else _coverage(kept["coverage"], quality),
         model=None if kept is None else _model(kept),
         turntables=[
@@ -193,7 +196,7 @@ def _reasons(content: dict[str, Any]) -> list[str]:
     shares, quality = content["area_shares"], content.get("quality")
     reasons = [f["message"] for f in found if f["severity"] == "error"]
     reasons.append(content["verdict"]["sentence"])
-    reasons.append(", ".join(f"{share:.0%} {name}" for name, share in shares.items()) + " of the surface")
+    reasons.append("of the surface, " + ", ".join(f"{share:.1%} is {name}" for name, share in shares.items()))
     if quality:
         reasons.append(
             f"the scans are {quality['verdict']} for {quality['profile']['name']}: expected error {quality['expected_error_mm']:.3f} mm, "
@@ -233,13 +236,12 @@ def _worth(quality: dict[str, Any] | None) -> list[tuple[str, str]]:
     """What the scans are worth, as lines of a table."""
     if quality is None:
         return []
-    rows = [
+    return [
         ("Worth", f"{quality['verdict']} for {quality['profile']['name']}"),
         ("Never seen", f"{quality['never_seen']:.1%} of the surface in reach, in {quality['gaps']} gaps"),
         ("Readings", f"{quality['spacing_mm']:.2f} mm apart"),
         ("Expected error", f"{quality['expected_error_mm']:.3f} mm"),
     ]
-    return rows + [(found["severity"].capitalize(), found["text"]) for found in quality["findings"]]
 
 
 def _coverage(counts: Any, quality: dict[str, Any] | None) -> Coverage:
@@ -280,29 +282,30 @@ def _model(kept: dict[str, Any]) -> Model:
             low = -high
             says = f" Half of it within {np.median(np.abs(known)):.3f} mm, 95 % within {np.quantile(np.abs(known), 0.95):.3f} mm."
         else:
-            low, high = float(known.min()), float(np.quantile(known, 0.98))
-            says = f" From {known.min():.3g} mm; median {np.median(known):.3g} mm."
+            low, high = 0.0, float(np.quantile(known, 0.98))
+            says = f" One per cent is below {np.quantile(known, 0.01):.3g} mm, half below {np.median(known):.3g} mm."
+            if key == "thickness_mm":  # what is far thicker than a wall is all alike
+                high = min(high, THICK * surface.extent_mm)
         fields.append(Field(key, label, "mm", values, low, max(high, low + 1e-6), _ABOUT[key] + says, colours))
     return Model(surface, about, fields, kept["flagged"])
 
 
 def _distance_maps(folder: Path) -> list[DistanceMap]:
-    """The maps asked for, then the ring."""
-    found = []
+    """The maps asked for, then the rest of the ring."""
+    found: dict[float, DistanceMap] = {}
     for path in sorted((folder / "maps").glob("azimuth_*/maps.npz"), key=lambda p: float(p.parent.name.split("_")[1])):
-        one = read_maps_npz(path)
+        one, azimuth = read_maps_npz(path), float(path.parent.name.split("_")[1])
         camera = one.camera
-        exact = isinstance(camera, PinholeCamera) and not camera.distortion
-        inner = (camera.fx, camera.fy, camera.cx, camera.cy) if exact and isinstance(camera, PinholeCamera) else None
-        label = f"{float(path.parent.name.split('_')[1]):g}°, {one.distance_mm.shape[1]} px"
-        found.append(DistanceMap(label, one.distance_mm, inner, one.world_from_camera))
-    ring = _read_arrays(folder / "maps" / "ring.npz")
-    if ring is not None:
-        found += [
-            DistanceMap(f"{azimuth:g}°", distance.astype(np.float64), tuple(ring["intrinsics"].tolist()), pose)
-            for azimuth, distance, pose in zip(ring["azimuths_deg"], ring["distance_mm"], ring["world_from_camera"])
-        ]
-    return found
+        inner = None
+        if isinstance(camera, PinholeCamera) and not any(camera.distortion):
+            inner = (camera.fx, camera.fy, camera.cx, camera.cy)
+        found[azimuth] = DistanceMap(f"{azimuth:g}°", one.distance_mm, inner, one.world_from_camera)
+    ring = _read_arrays(folder / "maps" / "ring.npz") or {"azimuths_deg": ()}
+    for k, azimuth in enumerate(ring["azimuths_deg"]):
+        if azimuth % 360 not in {known % 360 for known in found}:
+            inner, distance = tuple(ring["intrinsics"].tolist()), ring["distance_mm"][k].astype(np.float64)
+            found[float(azimuth)] = DistanceMap(f"{azimuth:g}°", distance, inner, ring["world_from_camera"][k])
+    return list(found.values())
 
 
 def _charts(folder: Path) -> list[Figure]:

@@ -9,7 +9,6 @@ import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -132,7 +131,8 @@ class DistanceMap:
 
 @dataclass(frozen=True)
 class ReportContent:
-    """Everything the report shows. `worth` are facts about all scans together; `provenance` are groups of facts by heading."""
+    """Everything the report shows. `worth` are facts about all scans together, `remarks`
+    (severity, sentence) what is to be said of them; `provenance` are groups of facts by heading."""
 
     title: str
     fit: bool
@@ -140,6 +140,7 @@ class ReportContent:
     reasons: Sequence[str]
     scans: Sequence[Scan] = ()
     worth: Sequence[tuple[str, str]] = ()
+    remarks: Sequence[tuple[str, str]] = ()
     coverage: Coverage | None = None
     model: Model | None = None
     turntables: Sequence[Turntable] = ()
@@ -150,8 +151,3 @@ class ReportContent:
     settings: str = "{}"
     provenance: Mapping[str, Sequence[tuple[str, str]]] = field(default_factory=dict)
     files: Sequence[tuple[str, str]] = ()
-
-
-def plain(value: Any) -> Any:
-    """Arrays as lists, for JSON."""
-    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value

@@ -44,7 +44,7 @@
     map.values.forEach((x, i) => { if (!Number.isNaN(x)) picture.data.set([...colourAt("viridis", 1 - (x - low) / (high - low || 1)), 255], 4 * i); });
     const eye = map.pose.slice(0, 3).map((row) => row[3]);
     byId("map-legend").replaceChildren();
-    drawScale(byId("map-legend"), "viridis", high, low, "mm", `Focal point at ${point(eye)}. The map holds steps of ${short(map.distance.step)} mm.`);
+    drawScale(byId("map-legend"), "viridis", high, low, "mm", `Focal point at ${point(eye)}. ${map.width} × ${map.height} pixels, in steps of ${short(map.distance.step)} mm.`);
     if (cursor) cursor = [Math.min(cursor[0], map.width - 1), Math.min(cursor[1], map.height - 1)];
     canvas.dataset.map = String(index);
     tellValue();

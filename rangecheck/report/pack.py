@@ -29,7 +29,7 @@ def packed(array: IntArray) -> dict[str, Any]:
         raise ArrayError(
             f"{array.dtype} {array.shape} cannot be packed; it must be uint8, uint16 or uint32 in one or two dimensions"
         )
-    rows = array.reshape(len(array), -1)
+    rows = array.reshape(len(array), 1 if array.ndim == 1 else array.shape[1])
     change = np.diff(rows, axis=0, prepend=np.zeros((1, rows.shape[1]), rows.dtype)).view(_SIGNED[width])
     folded = ((change << 1) ^ (change >> (8 * width - 1))).view(_UNSIGNED[width]).T.copy()
     planes = folded.reshape(-1, 1).view(np.uint8).T if folded.size else np.empty((width, 0), np.uint8)

@@ -26,6 +26,8 @@ from rangecheck.surface import ORIGIN_NAMES
 #: bytes that all frames together may take in the page
 FRAME_BUDGET = 4_500_000
 _QUALITIES = (88, 80, 70)
+#: PNG pictures above this size enter the page as WebP, no side longer than _PICTURE_PX
+_PICTURE_BYTES, _PICTURE_PX, _PICTURE_QUALITY = 60_000, 800, 86
 _STOPS = 33
 _SCRIPTS = ("shared.js", "turn.js", "controls.js", "viewer.js", "maps.js")
 _LIBRARY = ("three.core.min.js", "three.module.min.js")
@@ -59,7 +61,7 @@ def report_html(content: ReportContent) -> str:
         frames_note=frames_note,
         sphere=None if content.coverage is None else halves(content.coverage),
         seen=None if content.coverage is None else seen_share(content.coverage.counts),
-        data_uri=data_uri,
+        embedded=_light,
         style=style,
         script=script,
         policy=(
@@ -110,6 +112,20 @@ def _jpeg(path: Path, quality: int) -> bytes:
     picture = cv2.imdecode(np.frombuffer(read_bytes(path), np.uint8), cv2.IMREAD_COLOR)
     _, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return encoded.tobytes()
+
+
+def _light(picture: bytes) -> str:
+    """A picture as a data URI, large PNGs made lighter."""
+    if len(picture) <= _PICTURE_BYTES or not picture.startswith(b"\x89PNG"):
+        return data_uri(picture)
+    import cv2
+
+    image = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
+    shrink = _PICTURE_PX / max(image.shape[:2])
+    if shrink < 1:
+        image = cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+    _, encoded = cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, _PICTURE_QUALITY])
+    return data_uri(encoded.tobytes())
 
 
 def _map_form(one: DistanceMap) -> dict[str, Any]:

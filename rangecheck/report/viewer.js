@@ -124,6 +124,7 @@ async function startViewer() {
     return best;
   };
   const visit = (place) => {
+    if (skin.clippingPlanes && cut.distanceToPoint(new THREE.Vector3(...place)) < 0) { document.querySelector('input[name="section"][value=""]').checked = true; section(); }
     const i = nearest(place), [x, y, z] = model.normals.subarray(3 * i, 3 * i + 3);
     orbit.fly({ azimuth: ((Math.atan2(x, z) * 180) / Math.PI + 360) % 360, elevation: Math.max(-80, Math.min(80, (Math.asin(y) * 180) / Math.PI)), distance: orbit.home.distance * 0.3, target: place });
     byId("view-frame").scrollIntoView({ block: "center", behavior: calm.matches ? "auto" : "smooth" });
