@@ -70,7 +70,7 @@ def _refine(
 ) -> None:
     prior = np.empty(len(pixels), np.float32)
     _unevenness(plate.mean, *plate.shape, prior)
-    by_chance = settings.lobe or settings.diffuse
+    by_chance = settings.by_chance
     decay = _DECAY_OF_NOISE if by_chance else _DECAY_OF_EDGES
     least = _near_surfaces(plate.covered, plate.shape) * np.int32(2 if by_chance else 0)
     groups, spread = np.zeros(len(pixels), np.int32), np.empty(len(pixels), np.float32)

@@ -154,10 +154,12 @@ def _start_pinhole(camera, rotation, eye, pixels, numbers, width, each, centre, 
     bx, by, bz = rotation[0, 1], rotation[1, 1], rotation[2, 1]
     gx, gy, gz = rotation[0, 2], rotation[1, 2], rotation[2, 2]
     ex, ey, ez = eye[0], eye[1], eye[2]
+    per_row = 1.0 / width
     k = np.int64(0)
     for i in range(len(pixels)):
         pixel = pixels[i]
-        row = pixel // width
+        # half a pixel keeps the product off whole numbers by more than it is rounded: exact, and far cheaper than dividing
+        row = np.int64((pixel + 0.5) * per_row)
         stream = stream_of(seed, pixel)
         for j in range(each):
             u, v = float(pixel - row * width), float(row)

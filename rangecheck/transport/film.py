@@ -9,7 +9,7 @@ import numpy as np
 
 from rangecheck.arrays import FloatArray, IntArray
 from rangecheck.errors import CameraError
-from rangecheck.kernels import stage_kernel
+from rangecheck.kernels import in_chunks, stage_kernel
 from rangecheck.optics import Camera
 from rangecheck.transport.queues import KIND_NAMES
 
@@ -33,6 +33,12 @@ class Film:
     samples: IntArray = field(repr=False)
     budget: FloatArray = field(repr=False)
     lights: tuple[str, ...] = ()
+
+    def _repr_png_(self) -> bytes:
+        """A notebook's look at the picture, at an exposure of its own."""
+        from rangecheck.quick_look import radiance_png
+
+        return radiance_png(self.radiance)
 
     @property
     def mean_radiance(self) -> float:
@@ -101,10 +107,13 @@ class Plate:
 
     def develop(self, budget: FloatArray, lights: tuple[str, ...], rays: IntArray | None = None) -> Film:
         """The film; `rays` per pixel where they differ from the observations."""
-        count = self.count[:, None].astype(np.float32)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            variance = np.where(count > 1, self.spread / (count * (count - 1)), np.float32(np.nan)).astype(np.float32)
-            coverage = np.where(self.count > 0, self.covered / np.maximum(self.count, 1), 0).astype(np.float32)
+        variance, coverage = np.empty_like(self.spread), np.empty_like(self.covered)
+
+        def rows(start: int, stop: int) -> None:
+            own = slice(start, stop)
+            _develop(self.spread[own], self.covered[own], self.count[own], variance[own], coverage[own])
+
+        in_chunks(rows, len(self.count), 1 << 17)
         return Film(
             radiance=self.mean.reshape(*self.shape, -1),
             coverage=coverage.reshape(self.shape),
@@ -133,3 +142,13 @@ def expose(pixels, each, sample, face, mean, spread, covered, count):
             before = sample[i, c] - mean[pixel, c]
             mean[pixel, c] += before / count[pixel]
             spread[pixel, c] += before * (sample[i, c] - mean[pixel, c])
+
+
+@stage_kernel
+def _develop(spread, covered, count, variance, coverage):
+    """Variance of each pixel's mean, NaN where a single observation tells nothing of it, and the share of them that met a surface."""
+    for i in range(len(count)):
+        n = count[i]
+        coverage[i] = covered[i] / np.float32(n) if n > 0 else np.float32(0)
+        for c in range(spread.shape[1]):
+            variance[i, c] = spread[i, c] / (np.float32(n) * np.float32(n - 1)) if n > 1 else np.float32(np.nan)

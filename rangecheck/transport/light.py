@@ -10,9 +10,9 @@ import math
 
 import numpy as np
 
-from rangecheck.kernels import inline_kernel, stage_kernel
+from rangecheck.kernels import inline_kernel, pasted_kernel, stage_kernel
 from rangecheck.scene.sources import form_factor
-from rangecheck.transport.chance import SHADOW, key_of, point
+from rangecheck.transport.chance import SHADOW, key_of, point, turned
 from rangecheck.transport.geometry import frame_around
 from rangecheck.transport.queues import DIFFUSE
 from rangecheck.transport.reflection import diffuse_of, lobe_of
@@ -28,7 +28,7 @@ def _put_shadow(shadows, k, hits, i, dx, dy, dz, far, source):
     shadows.pixel[k], shadows.first[k], shadows.source[k] = hits.pixel[i], hits.first[i], source
 
 
-@stage_kernel
+@pasted_kernel
 def _put_gain(shadows, k, hits, i, materials, sources, source, dx, dy, dz, cosine, diffuse_light, lobe_light):
     """What shadow ray k brings: weight x (K_lm/pi x diffuse_light + K_sl f x lobe_light) x radiance; whether that is anything."""
     material = hits.material[i]
@@ -82,7 +82,7 @@ def aim(sources, materials, hits, start, stop, rays_per_source, with_diffuse, wi
     return k
 
 
-@stage_kernel
+@pasted_kernel
 def _aim_soft(sources, materials, hits, i, s, x, y, z, distance, rays, diffuse_light, shines, shadows, k):
     """Rays to places of source s, which stands wholly above the horizon or is cut by it.
 
@@ -97,10 +97,10 @@ def _aim_soft(sources, materials, hits, i, s, x, y, z, distance, rays, diffuse_l
     key = key_of(hits.stream[i], SHADOW + s)
     for j in range(rays):
         p, q = point(key, hits.number[i] * rays + j)
-        turn = 2.0 * math.pi * q
+        cos_turn, sin_turn = turned(q)
         along = 1.0 - depth if whole else 1.0 - p * depth
         aside = math.sqrt(sine2 * p) if whole else math.sqrt(max(0.0, 1.0 - along * along))
-        e, f = aside * math.cos(turn), aside * math.sin(turn)
+        e, f = aside * cos_turn, aside * sin_turn
         dx, dy, dz = along * x + e * ax + f * bx, along * y + e * ay + f * by, along * z + e * az + f * bz
         up = dx * nx + dy * ny + dz * nz
         if whole:

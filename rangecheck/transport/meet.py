@@ -13,7 +13,8 @@ import numpy as np
 from rangecheck.kernels import inline_kernel, stage_kernel
 from rangecheck.scene.surroundings import CONSTANT, add_surroundings
 from rangecheck.transport.geometry import place_hit
-from rangecheck.transport.queues import CAMERA, SPIKE
+from rangecheck.transport.irradiance_nodes import nodes_around
+from rangecheck.transport.queues import CAMERA, DIFFUSE, SPIKE
 
 
 @inline_kernel
@@ -35,17 +36,19 @@ def source_ahead(centre, radius, ox, oy, oz, dx, dy, dz, far):
 
 
 @stage_kernel
-def meet(geometry, sources, surroundings, rays, n, reflections, backdrop, gather_sources, hits, sample, tally):
+def meet(geometry, sources, surroundings, stored, rays, n, reflections, backdrop, gather_sources, hits, sample, tally):
     """Sort n cast rays: light that they see is added to `sample`, surfaces that they hit are written to `hits`.
 
     backdrop: the camera itself sees surroundings. gather_sources: rays that mirror see sources (else another way accounts for
-    them); rays that gather over a lobe or a hemisphere never do, for sources light surfaces directly. Returns the number of hits."""
+    them); rays that gather over a lobe or a hemisphere never do, for sources light surfaces directly. stored: light of their hemispheres that
+    is kept on the surfaces (see `irradiance`). Returns the number of hits."""
     # taken apart once, not ray by ray
     corners, normals, materials, skin = geometry
     centre, radius, radiance = sources
     sky, frame, period, softness, low, high, picture, boxes, glow = surroundings
     origin, direction, far, faces, us, vs, weight, pixels, kinds, firsts, streams, numbers = rays
-    place, shading, facing, arriving, hit_weight, hit_pixel, hit_first, hit_material, hit_stream, hit_number = hits
+    place, shading, facing, arriving, hit_weight, hit_pixel, hit_first, hit_material, hit_stream, hit_number, settled = hits
+    node_of_face, steps, kept, albedo, sides, shares = stored
     count = np.int64(0)
     dark = True
     for c in range(sample.shape[1]):
@@ -77,5 +80,23 @@ def meet(geometry, sources, surroundings, rays, n, reflections, backdrop, gather
             hit_weight[count, c] = weight[i, c]
         hit_pixel[count], hit_first[count], hit_stream[count] = pixel, firsts[i], streams[i]
         hit_material[count], hit_number[count] = materials[face], numbers[i]
+        settled[count] = False
+        if sides > 0:
+            out = 0.0
+            for axis in range(3):
+                out += facing[count, axis] * normals[face, axis]
+            if sides == 2 or out > 0.0:
+                settled[count] = True
+                shift = np.int64(0) if out > 0.0 else np.int64(len(kept) // 2)
+                a, b, d, p, q, r = nodes_around(node_of_face, steps, face, float(us[i]), float(vs[i]))
+                total = 0.0
+                for c in range(channels):
+                    white = p * kept[a + shift, c] + q * kept[b + shift, c] + r * kept[d + shift, c]
+                    light = weight[i, c] * albedo[materials[face], c] * white
+                    sample[pixel, c] += light
+                    total += light
+                first = DIFFUSE if kind == CAMERA else firsts[i]
+                for s in range(len(shares)):
+                    tally[first, reflections + 1, s] += total * shares[s]
         count += 1
     return count

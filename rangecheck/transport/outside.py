@@ -8,6 +8,8 @@ masking is our lobe in the rough limit. Sources must not reflect, as ours do not
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -23,11 +25,13 @@ from rangecheck.scene.surroundings import CONSTANT
 
 
 class OutsideRenderer:
-    """Mitsuba's picture of one scene from one camera; radiance (h, w, 3) float64. Raises DependencyMissing, SceneError."""
+    """Mitsuba's picture of one scene from one camera; radiance (h, w, 3) float64, or (h, w, 1) of a
+    monochrome variant. Raises DependencyMissing, SceneError."""
 
     def __init__(
-        self, scene: Scene, camera: PinholeCamera, world_from_camera: FloatArray, *, depth: int, variant: str = "scalar_rgb"
-    ) -> None:
+        self, scene: Scene, camera: PinholeCamera, world_from_camera: FloatArray, *, depth: int,
+        variant: str = "scalar_rgb", sampler: str = "independent",
+    ) -> None:  # fmt: skip
         try:
             import mitsuba
         except ImportError:
@@ -35,12 +39,15 @@ class OutsideRenderer:
                 "mitsuba", "comparison with an outside renderer", "pip install 'rangecheck[compare]'"
             ) from None
         mitsuba.set_variant(variant)
-        self._mitsuba = mitsuba
+        mitsuba.set_log_level(mitsuba.LogLevel.Error)
+        self._mitsuba, self._variant, self._sampler = mitsuba, variant, sampler
         with tempfile.TemporaryDirectory() as folder:
             self._scene = mitsuba.load_dict(self._described(scene, camera, world_from_camera, depth, Path(folder)))
 
     def render(self, samples: int, seed: int = 0) -> FloatArray:
         """With `samples` per pixel; pictures of different seeds are independent."""
+        # the variant is Mitsuba's global state; another renderer may have changed it
+        self._mitsuba.set_variant(self._variant)
         return np.asarray(self._mitsuba.render(self._scene, spp=samples, seed=seed), dtype=np.float64)[..., :3]
 
     def _described(
@@ -62,7 +69,7 @@ class OutsideRenderer:
                     "type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"},
                     "component_format": "float32",
                 },
-                "sampler": {"type": "independent"},
+                "sampler": {"type": self._sampler},
             },
         }  # fmt: skip
         for k, source in enumerate(scene.sources):
@@ -84,6 +91,19 @@ class OutsideRenderer:
                 _write_ply(path, scene, chosen)
                 described[f"part_{index}"] = {"type": "ply", "filename": str(path), "face_normals": True, "bsdf": _bsdf(material)}
         return described
+
+
+def outside_variants() -> list[tuple[str, str]]:
+    """(variant, sampler) that can be used here, the fastest first: those compiled by LLVM only where their library loads.
+
+    The library is tried in another process, for one of a wrong version ends the process that it is loaded into."""
+    tried = "import mitsuba; mitsuba.set_variant('llvm_ad_mono'); import drjit; print(float(drjit.llvm.ad.Float(2)[0] * 2))"
+    try:
+        proof = subprocess.run([sys.executable, "-c", tried], capture_output=True, text=True, timeout=120, check=False).stdout
+    except (OSError, subprocess.TimeoutExpired):
+        proof = ""
+    compiled = [("llvm_ad_mono", "independent"), ("llvm_ad_mono", "multijitter")] if proof.strip() == "4.0" else []
+    return [*compiled, ("scalar_rgb", "independent")]
 
 
 def _colour(values: FloatArray) -> dict[str, Any]:

@@ -39,7 +39,8 @@ class Rays(NamedTuple):
 
 class Hits(NamedTuple):
     """place, shading, facing, arriving (n, 3): point a skin off its face, shading normal, the face's normal, direction of the
-    ray that came; weight (n, c); pixel (n,); first (n,); material (n,) int16; stream, number (n,)."""
+    ray that came; weight (n, c); pixel (n,); first (n,); material (n,) int16; stream, number (n,); settled (n,) bool: the light of
+    its hemisphere is accounted for already."""
 
     place: FloatArray
     shading: FloatArray
@@ -51,6 +52,7 @@ class Hits(NamedTuple):
     material: IntArray
     stream: IntArray
     number: IntArray
+    settled: BoolArray
 
 
 class Shadows(NamedTuple):
@@ -86,7 +88,7 @@ def new_hits(n: int, channels: int) -> Hits:
     return Hits(
         _floats(n, 3), _floats(n, 3), _floats(n, 3), _floats(n, 3),
         _floats(n, channels), np.empty(n, np.int32), np.empty(n, np.uint8), np.empty(n, np.int16),
-        np.empty(n, np.uint32), np.empty(n, np.uint32),
+        np.empty(n, np.uint32), np.empty(n, np.uint32), np.empty(n, np.bool_),
     )  # fmt: skip
 
 

@@ -11,8 +11,8 @@ import math
 
 import numpy as np
 
-from rangecheck.kernels import stage_kernel
-from rangecheck.transport.chance import BRANCH, CHOICE, DIFFUSE_WAY, key_of, point
+from rangecheck.kernels import pasted_kernel, stage_kernel
+from rangecheck.transport.chance import BRANCH, CHOICE, DIFFUSE_WAY, key_of, point, turned
 from rangecheck.transport.geometry import frame_around
 from rangecheck.transport.queues import CAMERA, DIFFUSE, LOBE, SPIKE
 from rangecheck.transport.reflection import diffuse_of, draw_lobe, lobe_guess, lobe_of, spike_of
@@ -33,7 +33,7 @@ def mirror_ray(hits, i):
     return x * size, y * size, z * size
 
 
-@stage_kernel
+@pasted_kernel
 def _send(rays, k, hits, i, dx, dy, dz, kind, number):
     """Ray k leaves hit i; its weight is already written."""
     for axis in range(3):
@@ -45,12 +45,12 @@ def _send(rays, k, hits, i, dx, dy, dz, kind, number):
     rays.stream[k], rays.number[k] = key_of(hits.stream[i], BRANCH + kind), number
 
 
-@stage_kernel
+@pasted_kernel
 def _clear_of_face(hits, i, dx, dy, dz):
     return dx * hits.facing[i, 0] + dy * hits.facing[i, 1] + dz * hits.facing[i, 2] > 0.0
 
 
-@stage_kernel
+@pasted_kernel
 def _send_spike(materials, hits, i, share, least, rays, k):
     """The mirror ray, equation (34), unless it carries no more than `least`; returns the number of rays sent."""
     cosine = -(
@@ -70,7 +70,7 @@ def _send_spike(materials, hits, i, share, least, rays, k):
     return 1
 
 
-@stage_kernel
+@pasted_kernel
 def _send_lobe(materials, hits, i, share, least, number, rays, k):
     """One ray drawn by scattering order; `share` of such rays make the estimate."""
     material = hits.material[i]
@@ -103,7 +103,7 @@ def _send_lobe(materials, hits, i, share, least, number, rays, k):
     return 1
 
 
-@stage_kernel
+@pasted_kernel
 def _send_diffuse(materials, hits, i, share, least, number, rays, k):
     """One ray of the hemisphere, drawn by its cosine."""
     material = hits.material[i]
@@ -117,8 +117,9 @@ def _send_diffuse(materials, hits, i, share, least, number, rays, k):
     nx, ny, nz = float(hits.shading[i, 0]), float(hits.shading[i, 1]), float(hits.shading[i, 2])
     ax, ay, az, bx, by, bz = frame_around(nx, ny, nz)
     p, q = point(key_of(key_of(hits.stream[i], BRANCH + DIFFUSE), DIFFUSE_WAY), number)
-    radius, turn = math.sqrt(p), 2.0 * math.pi * q
-    e, f, up = radius * math.cos(turn), radius * math.sin(turn), math.sqrt(1.0 - p)
+    radius = math.sqrt(p)
+    cos_turn, sin_turn = turned(q)
+    e, f, up = radius * cos_turn, radius * sin_turn, math.sqrt(1.0 - p)
     dx, dy, dz = e * ax + f * bx + up * nx, e * ay + f * by + up * ny, e * az + f * bz + up * nz
     if not _clear_of_face(hits, i, dx, dy, dz):
         return 0
@@ -175,7 +176,7 @@ def split(materials, hits, start, stop, with_spike, lobe_rays, fan_step, diffuse
                 k += _send_fan(materials, hits, i, lobe_rays, fan_step, least, rays, k)
             for j in range(0 if fan_step > 0.0 else lobe_rays):
                 k += _send_lobe(materials, hits, i, float(lobe_rays), least, hits.number[i] * lobe_rays + j, rays, k)
-        for j in range(diffuse_rays):
+        for j in range(0 if hits.settled[i] else diffuse_rays):
             k += _send_diffuse(materials, hits, i, float(diffuse_rays), least, hits.number[i] * diffuse_rays + j, rays, k)
     return k
 
@@ -201,7 +202,7 @@ def choose_one(materials, hits, start, stop, with_spike, with_lobe, with_diffuse
                     spike = max(spike, carried * spike_of(materials, material, c, cosine))
                 if with_lobe:
                     lobe = max(lobe, carried * lobe_guess(materials, material, c, cosine))
-            if with_diffuse:
+            if with_diffuse and not hits.settled[i]:
                 diffuse = max(diffuse, carried * diffuse_of(materials, material, c))
         total = spike + lobe + diffuse
         if total <= least:

@@ -8,6 +8,7 @@ from rangecheck.errors import SettingError
 
 GLINTS = ("ray", "corners", "fraction")
 GATHERS = ("order", "fan")
+DIFFUSE_WAYS = ("paths", "cache")
 
 
 @dataclass(frozen=True)
@@ -21,6 +22,9 @@ class Settings:
     spike, lobe, diffuse  whether surfaces mirror, gather over the lobe, gather over the hemisphere (light from sources
                     is always reflected by all three)
     lobe_rays, diffuse_rays  rays of each hit that the camera sees; later hits send one ray for all
+    gather_diffuse  over the hemisphere: `paths` rays of each hit, `cache` what is kept on the surfaces, gathered once for the scene (where
+                    nothing shines)
+    records         places at which the light that is kept is gathered, before the surface's form asks for more
     depth           reflections followed at most; 1 is light straight from the sources
     least           paths that carry no more than this share are not followed (0: all are)
     roulette_from   from this reflection on paths end by chance, without bias; 0: never
@@ -46,14 +50,22 @@ class Settings:
     roulette_from: int = 3
     glints: str = "fraction"
     gather: str = "order"
+    gather_diffuse: str = "paths"
+    records: int = 6000
     fan_step_deg: float = 5.0
     backdrop: bool = True
+
+    @property
+    def by_chance(self) -> bool:
+        """Whether light is gathered by drawing directions, so that one sample tells little of its pixel."""
+        return self.lobe or (self.diffuse and self.gather_diffuse == "paths")
 
     def __post_init__(self) -> None:
         for name, low, high in (
             ("passes", 1, 1 << 20),
             ("each", 1, 1024),
             ("shadow_rays", 0, 1024),
+            ("records", 16, 1 << 20),
             ("depth", 1, 64),
             ("roulette_from", 0, 64),
         ):
@@ -62,7 +74,7 @@ class Settings:
         for name in ("lobe_rays", "diffuse_rays"):
             if not 0 <= getattr(self, name) <= 4096:
                 raise SettingError(f"{name} is {getattr(self, name)}; it must lie between 0 and 4096", key=name)
-        for name, known in (("glints", GLINTS), ("gather", GATHERS)):
+        for name, known in (("glints", GLINTS), ("gather", GATHERS), ("gather_diffuse", DIFFUSE_WAYS)):
             if getattr(self, name) not in known:
                 raise SettingError(f"{name} is {getattr(self, name)!r}; there are {', '.join(known)}", key=name)
         if not 0 < self.fan_step_deg <= 30:

@@ -13,6 +13,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from copy import copy
+from threading import Lock
 
 import numpy as np
 
@@ -26,6 +27,7 @@ from rangecheck.transport.camera_rays import PictureRays, pixel_order
 from rangecheck.transport.film import Film, Plate, expose
 from rangecheck.transport.geometry import geometry_of, sources_of
 from rangecheck.transport.glint import CELLS, aim_glints, corner_places, find_glints, glint_shares, keep_near, mirrored_corners
+from rangecheck.transport.irradiance import IrradianceCache, Stored, gather_irradiance, nothing_stored
 from rangecheck.transport.light import add_light, aim
 from rangecheck.transport.meet import meet
 from rangecheck.transport.queues import KIND_NAMES, LOBE, SPIKE, Hits, Rays, Shadows, Workspace
@@ -35,6 +37,8 @@ from rangecheck.transport.settings import Settings
 
 #: pixels that go through the stages together: two tiles
 CHUNK = 8192
+#: what the interpolation of kept irradiance may be off by, relative to the mean light on the surface
+KEPT_ERROR = 0.01
 #: most rays that wait in one queue
 _QUEUE = 32768
 
@@ -51,23 +55,47 @@ class Tracer:
         self.materials = materials_of(scene.materials)
         self.lights = (*(f"source {k}" for k in range(len(scene.sources))), "surroundings")
         self._idle: list[Workspace] = []
+        self._grey: Tracer | None = None
+        self._kept: dict[tuple[int, int], IrradianceCache] = {}
+        self._keeping = Lock()
 
     def grey(self) -> Tracer:
-        """The same scene at one wavelength only, for scenes whose wavelengths all look the same."""
+        """The same scene at one wavelength only, for scenes whose wavelengths all look the same; always the same tracer."""
+        if self._grey is not None:
+            return self._grey
         twin = copy(self)
         twin.scene = self.scene.grey()
         twin.sources = sources_of(twin.scene, self.caster, 1)
         twin.surroundings = twin.scene.surroundings.arrays(1)
         twin.materials = materials_of(twin.scene.materials)
-        twin._idle = []
+        twin._idle, twin._kept, twin._keeping = [], {}, Lock()
+        twin._grey = self._grey = twin
         return twin
 
+    def irradiance(self, depth: int, records: int) -> IrradianceCache:
+        """The light of up to `depth` reflections that is kept on the surfaces, from about so many records: gathered when it is first asked for, the same for every
+        picture of the scene. Raises SceneError where something shines."""
+        with self._keeping:
+            if (depth, records) not in self._kept:
+                self._kept[depth, records] = gather_irradiance(self, depth=depth, error=KEPT_ERROR, records=records)
+            return self._kept[depth, records]
+
+    def _stored(self, settings: Settings) -> Stored:
+        if settings.diffuse and settings.gather_diffuse == "cache":
+            return self.irradiance(settings.depth, settings.records).stored
+        return nothing_stored(self.scene.channels)
+
     def lit_as(self, scene: Scene) -> Tracer:
-        """The same things under the lights of `scene`, which holds the same things and as many sources."""
+        """The lights and materials of `scene`, whose surface and parts are the same."""
         twin = copy(self)
         twin.scene = scene
         twin.sources = sources_of(scene, self.caster, scene.channels)
         twin.surroundings = scene.surroundings.arrays(scene.channels)
+        twin.materials = materials_of(scene.materials)
+        twin.lights = (*(f"source {k}" for k in range(len(scene.sources))), "surroundings")
+        twin._grey, twin._kept, twin._keeping = None, {}, Lock()
+        if scene.channels != self.scene.channels:
+            twin._idle = []
         return twin
 
     def render(self, camera: Camera, world_from_camera: FloatArray, settings: Settings | None = None, *, seed: int = 0) -> Film:
@@ -166,6 +194,7 @@ class _Chunk:
         self._tracer, self._settings, self._work = tracer, settings, work
         self._tally = np.zeros((len(KIND_NAMES), settings.depth + 1, len(tracer.lights)))
         self._sample = work.samples(0)
+        self._stored = tracer._stored(settings)
 
     def shine(
         self, picture: PictureRays, pixels: IntArray, numbers: IntArray, seed: int
@@ -189,7 +218,7 @@ class _Chunk:
         self._cast(rays, n, coherent=reflections == 0)
         hits = self._work.hits(reflections, n)
         count = meet(
-            tracer.geometry, tracer.sources, tracer.surroundings, rays, n, reflections,
+            tracer.geometry, tracer.sources, tracer.surroundings, self._stored, rays, n, reflections,
             settings.backdrop, reflections != 1 or settings.glints == "ray", hits, self._sample, self._tally,
         )  # fmt: skip
         if count == 0 or reflections == settings.depth:

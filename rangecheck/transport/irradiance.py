@@ -1,0 +1,458 @@
+"""Diffuse interreflection kept on the surface: gathered once for a scene, looked up in every picture of it.
+
+What matters to a matt surface is its irradiance, which does not depend on who looks, and of which the part that other surfaces and the
+surroundings give varies slowly. So it is gathered at records, a few thousand places spread over the surface, and interpolated
+between them (Ward, Rubinstein & Clear, *A ray tracing solution for diffuse interreflection*, 1988). Each record looks out along
+rays drawn by their cosine. What they meet is remembered: the further reflections are sums over the same rays, not new ones
+(Goral et al. 1984, with rays for form factors).
+
+Light is counted as the radiance of a white surface, E/pi. What the interpolation costs is measured: at places between the records
+the same light is gathered twice with independent rays, and the root mean square of the difference, relative to the mean light
+on the surface, is `error`; noise of the two does not enter, for the product of two differences is free of it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from rangecheck.arrays import FloatArray, IntArray
+from rangecheck.errors import SceneError
+from rangecheck.kernels import in_chunks, inline_kernel, stage_kernel, thread_count
+from rangecheck.reflectance import Material
+from rangecheck.scene.surroundings import add_surroundings
+from rangecheck.transport.chance import DIFFUSE_WAY, key_of, point, stream_of, turned
+from rangecheck.transport.geometry import frame_around
+from rangecheck.transport.irradiance_nodes import Nodes, nodes_around, nodes_of
+from rangecheck.transport.light import add_light, aim
+from rangecheck.transport.queues import CAMERA, KIND_NAMES, LOBE, new_hits, new_rays, new_shadows
+from rangecheck.transport.reflection import materials_of
+
+if TYPE_CHECKING:
+    from rangecheck.transport.tracer import Tracer
+
+#: rays of each record
+RAYS = 128
+#: nodes on lattices of large faces, for each record that a surface begins with
+_NODES_PER_RECORD = 20
+#: how often the spacing is halved where a record and its neighbours disagree, and how many records there may be
+_LEVELS, _MOST_RECORDS = 3, 150_000
+#: records whose light is interpolated at a node
+_NEIGHBOURS = 8
+#: a record so much nearer than the others, in spacings, speaks alone
+_SELF = 0.02
+#: difference of unit normals that counts like one spacing of records
+_TURN = 0.35
+#: places at which the error is measured, and rays of each of the two gatherings there
+_PILOTS, _PILOT_RAYS = 512, 512
+#: reflections are followed until one adds less than this share of the light
+_CONVERGED = 1e-4
+_RECORDS_AT_ONCE, _NODES_AT_ONCE = 64, 8192
+
+
+class Stored(NamedTuple):
+    """The cache as `meet` reads it: node_of_face (m, 3), steps (m,), light (n sides, c) float32, the back side's nodes after the front's;
+    albedo (materials, c); sides 0 (nothing is stored), 1 or 2; shares (lights,) by which the light budget names the light."""
+
+    node_of_face: IntArray
+    steps: IntArray
+    light: FloatArray
+    albedo: FloatArray
+    sides: int
+    shares: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class IrradianceCache:
+    """error: root mean square of what interpolation is off by, relative to the mean light on the surface; records, rays of each;
+    reflections that were followed before the last; met: the error asked for was met."""
+
+    stored: Stored = field(repr=False)
+    error: float
+    records: int
+    rays: int
+    reflections: int
+    met: bool
+
+    def explain(self) -> str:
+        """One line for people."""
+        said = "" if self.met else ", more than was asked for"
+        return (
+            f"{self.records:,} records of {self.rays} rays, {self.reflections} reflections before the last; "
+            f"interpolation is off by {100 * self.error:.2g} % of the light on the surface{said}"
+        )
+
+
+def nothing_stored(channels: int) -> Stored:
+    """A cache in which nothing is found."""
+    return Stored(
+        np.empty((0, 3), np.int32), np.empty(0, np.int32), np.empty((0, channels), np.float32), np.empty((0, channels)), 0, np.empty(0)
+    )  # fmt: skip
+
+
+def may_be_cached(tracer: Tracer) -> bool:
+    """Whether nothing in the scene shines: what leaves a surface is then the same in every direction."""
+    return not tracer.materials.shiny.any()
+
+
+def gather_irradiance(
+    tracer: Tracer, *, depth: int = 64, error: float = 0.01, records: int = 6000, shadow_rays: int = 1, seed: int = 0
+) -> IrradianceCache:
+    """The light that reaches every place of a matt scene from its surroundings and after up to depth - 1 reflections at other places, with
+    interpolation off by at most `error` of the mean light on the surface, or as near as the most records bring it (`met` says).
+
+    records: how many there are before any place asks for more, if the surface were flat; shadow_rays to each source, 0 to its middle alone. Same bytes on any number of threads. Raises SceneError where something shines."""
+    if not may_be_cached(tracer):
+        names = ", ".join(m.name for m, shiny in zip(tracer.scene.materials, tracer.materials.shiny) if shiny)
+        raise SceneError(
+            f"irradiance cannot be kept where surfaces shine ({names}); follow paths instead: gather_diffuse='paths'"
+        )
+    return _Gathering(tracer, depth, records, shadow_rays, seed).until(error)
+
+
+class _Gathering:
+    """One scene's nodes, its light straight from the sources, and what records gather of it."""
+
+    def __init__(self, tracer: Tracer, depth: int, records: int, shadow_rays: int, seed: int) -> None:
+        self.tracer, self.depth, self.records, self.shadow_rays, self.seed = tracer, depth, records, shadow_rays, seed
+        self.channels = tracer.scene.channels
+        nodes = nodes_of(tracer.geometry, tracer.caster.vertices, tracer.caster.faces, _NODES_PER_RECORD * records)
+        self.sides = 1 if _is_closed(tracer.caster.faces) else 2
+        self.node_of_face, self.steps = nodes.node_of_face, nodes.steps
+        self.place = np.concatenate([nodes.place] * self.sides)
+        self.normal = np.concatenate([nodes.normal, -nodes.normal][: self.sides])
+        self.albedo = np.stack([m.strengths()[0] for m in tracer.scene.materials])
+        self.direct, by_source = self._direct_light(nodes)
+        corners = tracer.geometry.corners.reshape(-1, 3, 3).astype(np.float64)
+        self.area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        self.by_light = np.append(by_source, 0.0)
+
+    def until(self, error: float) -> IrradianceCache:
+        spacing = math.sqrt(self.sides * float(self.area.sum()) / self.records)
+        everywhere = np.arange(len(self.place))
+        chosen, met = np.empty(0, np.int64), _nothing_met(self.channels)
+        candidates, step = everywhere, spacing
+        for level in range(_LEVELS + 1):
+            fresh = np.setdiff1d(candidates[self._one_in_each(self._cells(candidates, step), candidates, step)], chosen)
+            if len(chosen) + len(fresh) > _MOST_RECORDS:
+                break
+            met = met.and_also(self._look(self.place[fresh], self.normal[fresh], RAYS, self.seed, len(chosen)))
+            chosen = np.append(chosen, fresh)
+            if level < _LEVELS:
+                fresh_rows = np.arange(len(chosen) - len(fresh), len(chosen))
+                rough = chosen[fresh_rows[self._disagreement(met, chosen, spacing)[fresh_rows] > 2 * error]]
+                marked = np.unique(self._cells(rough, step))
+                candidates = candidates[np.isin(self._cells(candidates, step), marked)]
+                step /= 2
+                if not len(candidates):
+                    break
+        return self._solve(chosen, met, spacing, error)
+
+    def _solve(self, chosen: IntArray, met: _Met, spacing: float, error: float) -> IrradianceCache:
+        near, weight = self._neighbours(chosen, spacing)
+        light = _interpolated(near, weight, met.sky)
+        total = float(self.direct.mean(dtype=np.float64)) + float(light.mean(dtype=np.float64))
+        reflections = 0
+        for _ in range(1, self.depth):
+            reflections += 1
+            brighter = _interpolated(near, weight, self._sum(met, light))
+            step = float(np.sqrt(((brighter - light).astype(np.float64) ** 2).mean()))
+            light = brighter
+            if step <= _CONVERGED * total:
+                break
+        shares = self.by_light.copy()
+        shares[-1] = float(met.sky.sum(dtype=np.float64)) * len(light) / max(len(met.sky), 1)
+        shares = shares / shares.sum() if shares.sum() > 0 else shares
+        stored = Stored(self.node_of_face, self.steps, light, self.albedo, self.sides, shares)
+        off = self._error(stored)
+        return IrradianceCache(stored, off, len(chosen), met.rays, reflections, off <= error)
+
+    def _direct_light(self, nodes: Nodes) -> tuple[FloatArray, FloatArray]:
+        """(n, c) float32 radiance of white nodes in the light of the sources alone; (sources,) how much of it is whose."""
+        tracer, n = self.tracer, len(self.place)
+        light, sources = np.zeros((n, self.channels), np.float32), len(tracer.sources.radius)
+        white = materials_of((Material("white", K_lm=1.0, wavelengths_um=tracer.scene.materials[0].wavelengths_um),))
+        if not sources:
+            return light, np.zeros(0)
+
+        def some(start: int, stop: int) -> FloatArray:
+            tally = np.zeros((len(KIND_NAMES), 2, sources + 1))
+            hits = new_hits(stop - start, self.channels)
+            shadows = new_shadows((stop - start) * sources * max(1, self.shadow_rays), self.channels)
+            with np.errstate(over="ignore"):
+                _stand(self.place[start:stop], self.normal[start:stop], tracer.geometry.skin, self.seed, start, hits)
+                k = aim(tracer.sources, white, hits, 0, stop - start, self.shadow_rays, True, False, shadows)
+            tracer.caster.occluded_local(
+                shadows.origin[:k], shadows.direction[:k], shadows.far[:k], shadows.blocked[:k], coherent=True
+            )
+            add_light(shadows, k, 1, light[start:stop], tally, LOBE)
+            return tally.sum(axis=(0, 1))[:sources]
+
+        return light, np.sum(in_chunks(some, n, _NODES_AT_ONCE), axis=0)
+
+    def _cells(self, nodes: IntArray, step: float) -> IntArray:
+        """(k,) which cube of side `step`, and which main direction of the normal, each node belongs to."""
+        place, normal = self.place[nodes], self.normal[nodes]
+        cube = np.floor(place / step).astype(np.int64)
+        axis = np.abs(normal).argmax(axis=1)
+        turn = 2 * axis + (normal[np.arange(len(axis)), axis] < 0)
+        return ((cube[:, 0] * 2097152 + cube[:, 1]) * 2097152 + cube[:, 2]) * 6 + turn
+
+    def _one_in_each(self, cells: IntArray, nodes: IntArray, step: float) -> IntArray:
+        """Rows of one node of every cell, the one nearest to its middle."""
+        aside = np.square((self.place[nodes] / step) % 1.0 - 0.5).sum(axis=1)
+        order = np.lexsort((aside, cells))
+        return np.sort(order[np.append(True, np.diff(cells[order]) != 0)])
+
+    def _disagreement(self, met: _Met, chosen: IntArray, spacing: float) -> FloatArray:
+        """(records,) how far the light that each sees is from what the others would have it see, relative to the mean light."""
+        seen = self._sum(met, np.zeros_like(self.direct))
+        near, weight = self._nearest(chosen, chosen, spacing, _NEIGHBOURS + 1)
+        weight = np.where(near == np.arange(len(chosen))[:, None], 0, weight)
+        total = weight.sum(axis=1, keepdims=True)
+        others = (weight[..., None] * seen[near]).sum(axis=1) / np.maximum(total, 1e-30)
+        mean = float((self.direct.mean(dtype=np.float64)) + seen.mean(dtype=np.float64))
+        gap = np.where(total > 0, np.abs(others - seen), 0).max(axis=1)
+        return np.asarray(gap / mean if mean > 0 else gap)
+
+    def _neighbours(self, chosen: IntArray, spacing: float) -> tuple[IntArray, FloatArray]:
+        """(n, k) int32 rows of the records nearest to every node, and (n, k) float32 weights that sum to 1."""
+        near, weight = self._nearest(chosen, np.arange(len(self.place)), spacing, _NEIGHBOURS)
+        return near.astype(np.int32), (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
+
+    def _nearest(self, chosen: IntArray, nodes: IntArray, spacing: float, count: int) -> tuple[IntArray, FloatArray]:
+        """(k, count) rows of the records nearest to these nodes by place and normal, and weights that fall from all to 0
+        at the last (Franke & Little's form of Shepard's)."""
+        from scipy.spatial import cKDTree
+
+        where = np.hstack([self.place / spacing, self.normal / _TURN])
+        k = min(count, len(chosen))
+        distance, near = cKDTree(where[chosen]).query(where[nodes], k=k, workers=thread_count())
+        distance, near = distance.reshape(len(nodes), k), near.reshape(len(nodes), k)
+        reach = 1.001 * distance[:, -1:] + 1e-9
+        return near, np.square((reach - distance) / (reach * (distance + _SELF)))
+
+    def _look(self, place: FloatArray, normal: FloatArray, rays: int, seed: int, first: int = 0) -> _Met:
+        """What `rays` from each place meet; places count from `first`, by which their chance is told apart."""
+        tracer, n = self.tracer, len(place)
+        met = _Met(
+            np.empty(n * rays, np.int32), np.empty(n * rays, np.float32), np.empty(n * rays, np.float32),
+            np.zeros((n, self.channels), np.float32), rays,
+        )  # fmt: skip
+        sky = tracer.surroundings
+
+        def some(start: int, stop: int) -> None:
+            queue = new_rays((stop - start) * rays, self.channels)
+            own = slice(start * rays, stop * rays)
+            with np.errstate(over="ignore"):
+                _look_out(
+                    place[start:stop], normal[start:stop], tracer.geometry.skin, rays, seed & 0xFFFFFFFF, first + start, queue
+                )
+            face, u, v = met.face[own], met.u[own], met.v[own]
+            tracer.caster.closest_local(queue.origin, queue.direction, queue.far, face, u, v)
+            _see_sky(sky, tracer.geometry.normals, tracer.geometry.corners, queue, rays, self.sides, face, met.sky[start:stop])
+
+        in_chunks(some, n, max(1, _RECORDS_AT_ONCE * RAYS // rays))
+        return met
+
+    def _sum(self, met: _Met, light: FloatArray) -> FloatArray:
+        """(records, c) float32: what they see if the nodes have this light beside that of the sources."""
+        total = (self.direct + light).astype(np.float32)
+        seen = np.empty_like(met.sky)
+        materials = self.tracer.geometry.material
+
+        def some(start: int, stop: int) -> None:
+            own = slice(start * met.rays, stop * met.rays)
+            _sum_up(
+                self.node_of_face, self.steps, total, self.albedo, materials, len(total) // self.sides, met.rays,
+                met.face[own], met.u[own], met.v[own], met.sky[start:stop], seen[start:stop],
+            )  # fmt: skip
+
+        in_chunks(some, len(seen), 1024)
+        return seen
+
+    def _error(self, stored: Stored) -> float:
+        """What interpolation is off by, from places anywhere on the surface, as many where there is more of it."""
+        chance = np.random.default_rng([self.seed, 0x1CACE])
+        places = min(_PILOTS, 4 * len(self.area))
+        edges = np.cumsum(self.area)
+        face = np.searchsorted(edges, (np.arange(places) + chance.random(places)) / places * edges[-1]).clip(0, len(edges) - 1)
+        u, v = chance.random((2, places))
+        u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+        back = chance.random(places) < (0.5 if self.sides == 2 else 0.0)
+        corners = self.tracer.geometry.corners.reshape(-1, 3, 3)[face]
+        normals = self.tracer.geometry.normals.reshape(-1, 3, 3)[face]
+        weights = np.stack([1 - u - v, u, v], axis=1)[:, :, None]
+        place = np.ascontiguousarray((weights * corners).sum(axis=1), np.float32)
+        normal = (weights * normals).sum(axis=1)
+        normal *= np.where(back, -1, 1)[:, None] / np.linalg.norm(normal, axis=1, keepdims=True)
+        normal = np.ascontiguousarray(normal, np.float32)
+        kept, straight = (np.empty((places, self.channels), np.float32) for _ in range(2))
+        _look_up(stored, self.direct, face, u, v, back, kept, straight)
+        gaps = [
+            self._sum(self._look(place, normal, _PILOT_RAYS, self.seed + 0x5EED + k), stored.light) - kept if self.depth > 1
+            else self._look(place, normal, _PILOT_RAYS, self.seed + 0x5EED + k).sky - kept
+            for k in (0, 1)
+        ]  # fmt: skip
+        mean = float((kept + straight).mean(dtype=np.float64))
+        product = (gaps[0].astype(np.float64) * gaps[1]).mean(axis=1)
+        squared = float(product.mean()) + 2.0 * float(product.std()) / math.sqrt(places)
+        return math.sqrt(max(squared, 0.0)) / mean if mean > 0 else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Met:
+    """face (records rays,): what each ray met: a face, its back side -2 - face, or -1 the surroundings; u, v; sky (records, c)."""
+
+    face: IntArray
+    u: FloatArray
+    v: FloatArray
+    sky: FloatArray
+    rays: int
+
+    def and_also(self, other: _Met) -> _Met:
+        """These records and others, after them."""
+        return _Met(
+            np.concatenate([self.face, other.face]), np.concatenate([self.u, other.u]), np.concatenate([self.v, other.v]),
+            np.concatenate([self.sky, other.sky]), other.rays,
+        )  # fmt: skip
+
+
+def _nothing_met(channels: int) -> _Met:
+    return _Met(
+        np.empty(0, np.int32), np.empty(0, np.float32), np.empty(0, np.float32), np.empty((0, channels), np.float32), RAYS
+    )
+
+
+def _is_closed(faces: IntArray) -> bool:
+    """Whether every edge is passed as often one way as the other: then only one side is ever seen from outside."""
+    a = faces.astype(np.int64)
+    b = np.roll(a, -1, axis=1)
+    size = int(faces.max()) + 1
+    forward, backward = (a * size + b).ravel(), (b * size + a).ravel()
+    forward.sort()
+    backward.sort()
+    return bool((forward == backward).all())
+
+
+def _interpolated(near: IntArray, weight: FloatArray, light: FloatArray) -> FloatArray:
+    """(n, c) float32 at the nodes of (records, c) at the records."""
+    result = np.empty((len(near), light.shape[1]), np.float32)
+    in_chunks(lambda start, stop: _mix(near[start:stop], weight[start:stop], light, result[start:stop]), len(near), 32768)
+    return result
+
+
+@stage_kernel
+def _mix(near, weight, light, result):
+    for i in range(len(near)):
+        for c in range(light.shape[1]):
+            total = 0.0
+            for k in range(near.shape[1]):
+                total += weight[i, k] * light[near[i, k], c]
+            result[i, c] = total
+
+
+@stage_kernel
+def _stand(place, normal, skin, seed, first, hits):
+    """Nodes as hits that somebody sees who looks along their normals."""
+    for i in range(len(place)):
+        for axis in range(3):
+            hits.place[i, axis] = place[i, axis] + skin * normal[i, axis]
+            hits.shading[i, axis] = hits.facing[i, axis] = normal[i, axis]
+            hits.arriving[i, axis] = -normal[i, axis]
+        for c in range(hits.weight.shape[1]):
+            hits.weight[i, c] = 1.0
+        hits.pixel[i], hits.first[i], hits.material[i] = i, CAMERA, 0
+        hits.stream[i], hits.number[i] = stream_of(seed, first + i), 0
+
+
+@stage_kernel
+def _look_out(place, normal, skin, count, seed, first, rays):
+    """`count` rays from each place, spread evenly by their cosine; each carries its share of the hemisphere's light."""
+    k = np.int64(0)
+    for i in range(len(place)):
+        nx, ny, nz = float(normal[i, 0]), float(normal[i, 1]), float(normal[i, 2])
+        ax, ay, az, bx, by, bz = frame_around(nx, ny, nz)
+        key = key_of(stream_of(seed, first + i), DIFFUSE_WAY)
+        for j in range(count):
+            p, q = point(key, j)
+            aside, up = math.sqrt(p), math.sqrt(1.0 - p)
+            cos_turn, sin_turn = turned(q)
+            e, f = aside * cos_turn, aside * sin_turn
+            rays.direction[k, 0] = e * ax + f * bx + up * nx
+            rays.direction[k, 1] = e * ay + f * by + up * ny
+            rays.direction[k, 2] = e * az + f * bz + up * nz
+            for axis in range(3):
+                rays.origin[k, axis] = place[i, axis] + skin * normal[i, axis]
+            rays.far[k] = math.inf
+            for c in range(rays.weight.shape[1]):
+                rays.weight[k, c] = 1.0 / count
+            k += 1
+
+
+@inline_kernel
+def seen_from_behind(corners, normals, face, dx, dy, dz):
+    """Whether a ray meets the side of a face that its corners' normals turn away from."""
+    ex, ey, ez = corners[face, 3] - corners[face, 0], corners[face, 4] - corners[face, 1], corners[face, 5] - corners[face, 2]
+    fx, fy, fz = corners[face, 6] - corners[face, 0], corners[face, 7] - corners[face, 1], corners[face, 8] - corners[face, 2]
+    gx, gy, gz = ey * fz - ez * fy, ez * fx - ex * fz, ex * fy - ey * fx
+    out = gx * normals[face, 0] + gy * normals[face, 1] + gz * normals[face, 2]
+    return (gx * dx + gy * dy + gz * dz > 0.0) == (out > 0.0)
+
+
+@stage_kernel
+def _see_sky(surroundings, normals, corners, rays, count, sides, faces, light):
+    """Add what rays see of the surroundings to their records; mark back sides."""
+    sky, frame, period, softness, low, high, picture, boxes, glow = surroundings
+    for k in range(len(faces)):
+        face = np.int64(faces[k])
+        dx, dy, dz = float(rays.direction[k, 0]), float(rays.direction[k, 1]), float(rays.direction[k, 2])
+        if face < 0:
+            add_surroundings(
+                sky, frame, period, softness, low, high, picture, boxes, glow, dx, dy, dz, rays.weight, k, light, k // count
+            )  # fmt: skip
+        elif seen_from_behind(corners, normals, face, dx, dy, dz):
+            faces[k] = -2 - face
+
+
+@stage_kernel
+def _sum_up(node_of_face, steps, light, albedo, materials, nodes, count, faces, us, vs, sky, seen):
+    """Light that records see: of the surroundings, and of the places that their rays met.
+
+    The back side of a closed surface is met only by rays that start below the faces of a rounded edge; they are left out."""
+    back = nodes if len(light) > nodes else np.int64(0)
+    k = np.int64(0)
+    for i in range(len(seen)):
+        left_out = 0
+        for c in range(seen.shape[1]):
+            seen[i, c] = 0.0
+        for _ in range(count):
+            face, shift = np.int64(faces[k]), np.int64(0)
+            if face < -1:
+                face, shift = -2 - face, back
+                if back == 0:
+                    left_out += 1
+                    face = np.int64(-1)
+            if face >= 0:
+                a, b, d, p, q, r = nodes_around(node_of_face, steps, face, float(us[k]), float(vs[k]))
+                for c in range(seen.shape[1]):
+                    white = p * light[a + shift, c] + q * light[b + shift, c] + r * light[d + shift, c]
+                    seen[i, c] += albedo[materials[face], c] * white
+            k += 1
+        for c in range(seen.shape[1]):
+            seen[i, c] = (sky[i, c] * count + seen[i, c]) / max(count - left_out, 1)
+
+
+@stage_kernel
+def _look_up(stored, direct, face, u, v, back, kept, straight):
+    """Stored and direct light at places of faces."""
+    nodes = len(stored.light) // stored.sides
+    for i in range(len(face)):
+        shift = nodes if back[i] else np.int64(0)
+        a, b, d, p, q, r = nodes_around(stored.node_of_face, stored.steps, face[i], u[i], v[i])
+        for c in range(kept.shape[1]):
+            kept[i, c] = p * stored.light[a + shift, c] + q * stored.light[b + shift, c] + r * stored.light[d + shift, c]
+            straight[i, c] = p * direct[a + shift, c] + q * direct[b + shift, c] + r * direct[d + shift, c]
