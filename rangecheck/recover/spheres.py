@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rangecheck.arrays import FloatArray, require
+from rangecheck.arrays import FloatArray, IntArray, require
 from rangecheck.errors import SceneError
 from rangecheck.recover.sight import Sight, sphere_sight
 
@@ -86,7 +86,12 @@ def rough_matt(normals: FloatArray, views: FloatArray, direction: FloatArray, sl
 
 
 def lights_from_matt(
-    pictures: Sequence[FloatArray], outline: Outline, *, rough: bool = True, saturation: float = 1.0, starts: FloatArray | None = None
+    pictures: Sequence[FloatArray],
+    outline: Outline,
+    *,
+    rough: bool = True,
+    saturation: float = 1.0,
+    starts: FloatArray | None = None,
 ) -> MattFit:
     """Directions and gains of one lamp each from pictures (h, w) of a matt sphere, linear, in parts of full scale.
 
@@ -111,7 +116,9 @@ def lights_from_matt(
 
         return np.asarray(least_squares(away, start, loss="soft_l1").x)
 
-    begin = [_brightest(few, of(few, k)) if starts is None else starts[k] * float(np.nanmax(of(few, k))) for k in range(len(pictures))]
+    begin = [
+        _brightest(few, of(few, k)) if starts is None else starts[k] * float(np.nanmax(of(few, k))) for k in range(len(pictures))
+    ]
 
     def all_of(slope: float) -> FloatArray:
         return np.array([solved(k, start, slope) for k, start in enumerate(begin)])
@@ -154,7 +161,9 @@ def _brightest(sight: Sight, values: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.lstsq(sight.normals[used], values[used], rcond=None)[0])
 
 
-def prediction_errors(pictures: Sequence[FloatArray], outline: Outline, lights: FloatArray, *, saturation: float = 1.0) -> FloatArray:
+def prediction_errors(
+    pictures: Sequence[FloatArray], outline: Outline, lights: FloatArray, *, saturation: float = 1.0
+) -> FloatArray:
     """(k,) rms error, parts of full scale, with which each picture is predicted by a surface fitted to all others under the lights given.
 
     Surface and irradiance are one gain and one slope for all pictures; nothing of the predicted picture is used but its light's direction."""
@@ -165,7 +174,7 @@ def prediction_errors(pictures: Sequence[FloatArray], outline: Outline, lights: 
     few = np.arange(0, len(sight), max(1, len(sight) // 3000))
     values = [np.asarray(p, np.float64).reshape(-1)[sight.pixel] for p in pictures]
 
-    def away(numbers: FloatArray, k: int, which: FloatArray) -> FloatArray:
+    def away(numbers: FloatArray, k: int, which: IntArray) -> FloatArray:
         used = which[values[k][which] < saturation]
         return numbers[0] * rough_matt(sight.normals[used], sight.views[used], lights[k], numbers[1]) - values[k][used]
 

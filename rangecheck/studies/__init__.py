@@ -15,10 +15,12 @@ if TYPE_CHECKING:
 #: every study by name, and the module whose `study(quick, part)` makes it
 STUDIES = {
     "fit": "rangecheck.studies.fit",
+    "consistency": "rangecheck.studies.consistency",
     "pictures": "rangecheck.studies.pictures",
     "meshing": "rangecheck.studies.meshing",
     "reflectance": "rangecheck.studies.reflectance",
     "transport": "rangecheck.studies.transport",
+    "rays": "rangecheck.studies.rays",
     "renderers": "rangecheck.studies.renderers",
 }
 
