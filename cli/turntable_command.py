@@ -25,10 +25,13 @@ from .common import common, settings_from
 @click.option("--fps", type=click.IntRange(1, 240), help="Frames per second of the video.")
 @click.option("--frame-format", type=click.Choice(["png", "exr"]), help="Frames as pictures, or as linear radiance or distances.")
 @click.option("--sheet", type=click.Path(), metavar="FILE", help="Also a contact sheet of all frames, a .png.")
+@click.option(
+    "--consistency", is_flag=True, help="Measure what the frames show: slope noise, speckle, jumping highlights, flagged places."
+)
 @click.option("--scheduler", metavar="ADDRESS", help="Make the frames on a dask cluster, for example tcp://10.0.0.1:8786.")
 @common("out_file", "unit", "size", "frames", "frames_dir", "tolerance", "seed", "config", "set", "force")
 def command(
-    scene, materials, show, lights, elevation, swing, fps, frame_format, sheet, scheduler, out, unit, size, frames, frames_dir,
+    scene, materials, show, lights, elevation, swing, fps, frame_format, sheet, consistency, scheduler, out, unit, size, frames, frames_dir,
     tolerance, seed, config, assignments, force, reporter,
 ):  # fmt: skip
     """Frames and video of an orbit; resumes where it was stopped. The video's name says what it becomes: .mp4, .webm, .gif or .apng.
@@ -61,6 +64,7 @@ def command(
         frames_dir=frames_dir,
         materials=materials,
         sheet=sheet,
+        consistency=consistency,
         scheduler=scheduler,
         force=force,
         reporter=reporter,

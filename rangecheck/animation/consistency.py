@@ -16,7 +16,7 @@ import numpy as np
 
 from rangecheck.arrays import BoolArray, FloatArray, IntArray
 from rangecheck.errors import SurfaceError
-from rangecheck.kernels import in_chunks, kernel
+from rangecheck.kernels import in_chunks, kernel, thread_count
 from rangecheck.maps import Maps, trace_maps
 from rangecheck.scan import RangeScan
 from rangecheck.surface import Surface
@@ -73,10 +73,12 @@ def faces_seen(frames: Iterable[Maps], count: int) -> IntArray:
     return total
 
 
-def measure_consistency(surface: Surface, seen: IntArray | BoolArray | None = None) -> Consistency:
+def measure_consistency(surface: Surface, seen: IntArray | BoolArray | None = None, *, most: int | None = None) -> Consistency:
     """Slope and height noise over the faces with `seen` > 0 (all by default), and the places that stand out.
 
-    Raises SurfaceError when fewer than NEIGHBOURS facets have area and were seen."""
+    With `most`, about so many of them, evenly spread, are judged, each among all of its neighbours; then `residual_deg` is known of
+    these alone, and a place needs to be seen by several of them. Raises SurfaceError when fewer than NEIGHBOURS facets have area and
+    were seen."""
     from scipy.spatial import cKDTree
 
     chosen: BoolArray = np.ones(len(surface.faces), bool) if seen is None else np.asarray(seen, np.int64) > 0
@@ -86,49 +88,59 @@ def measure_consistency(surface: Surface, seen: IntArray | BoolArray | None = No
             f"{len(used)} facets were seen; at least {NEIGHBOURS} are needed to tell noise from shape", facets=len(used)
         )
     normals, middles = surface.face_normals[used], surface.triangles[used].mean(axis=1)
-    _, near = cKDTree(middles).query(middles, NEIGHBOURS, workers=1)
+    judged = _spread(len(used), most)
+    near = cKDTree(middles).query(middles[judged], NEIGHBOURS, workers=thread_count())[1]
     part = surface.part_of_face[used]
-    slope, unused = np.full(len(used), np.nan), np.empty(len(used))
+    slope, unused = np.full(len(judged), np.nan), np.empty(len(judged))
 
     def chunk(start: int, stop: int) -> None:
         here = slice(start, stop)
-        _residuals(normals, middles, part, near[here], start, ALIKE, slope[here], unused[here])
+        _residuals(normals, middles, part, near[here], judged[here], ALIKE, slope[here], unused[here])
 
-    in_chunks(chunk, len(used), _FACES_PER_CHUNK)
-    heights = _vertex_heights(surface, np.unique(surface.faces[used]))
-    area = surface.face_areas[used]
+    in_chunks(chunk, len(judged), _FACES_PER_CHUNK)
+    heights = _vertex_heights(surface, np.unique(surface.faces[used]), most)
+    area = surface.face_areas[used][judged]
     known = np.isfinite(slope)
     if not known.any():
         raise SurfaceError("no facet has enough neighbours on its own side; the surface is too coarse to tell noise from shape")
     # median of a Rayleigh law is sqrt(2 ln 2) per axis; the angle's RMS is sqrt(2) per axis
     level = _weighted_median(slope[known], area[known]) / math.sqrt(math.log(2.0))
     residual = np.full(len(surface.faces), np.nan)
-    residual[used] = np.degrees(slope)
+    residual[used[judged]] = np.degrees(slope)
+    if len(judged) < len(used):
+        near = cKDTree(middles[judged]).query(middles[judged], min(NEIGHBOURS, len(judged)))[1]
     return Consistency(
         slope_noise_deg=math.degrees(level),
         slope_rms_deg=math.degrees(math.sqrt(float(np.average(slope[known] ** 2, weights=area[known])))),
         height_noise_mm=1.4826 * float(np.median(np.abs(heights))) if len(heights) else math.nan,
         facets=int(known.sum()),
         residual_deg=residual,
-        places=_places(middles, slope, near, FLAGGED_TIMES * level),
+        places=_places(middles[judged], slope, near, FLAGGED_TIMES * level),
     )
 
 
-def _vertex_heights(surface: Surface, used: IntArray) -> FloatArray:
+def _spread(count: int, most: int | None) -> IntArray:
+    """Every k-th of so many, about `most` of them."""
+    return np.arange(0, count, max(1, -(-count // most)) if most else 1)
+
+
+def _vertex_heights(surface: Surface, used: IntArray, most: int | None) -> FloatArray:
     """(n,) standardised heights, mm, of the vertices `used` over the quadrics of their neighbours, where they have enough."""
     from scipy.spatial import cKDTree
 
     if len(used) < NEIGHBOURS:
         return np.empty(0)
     points, normals = surface.vertices[used], surface.vertex_normals[used]
-    _, near = cKDTree(points).query(points, NEIGHBOURS, workers=1)
-    height, unused = np.full(len(used), np.nan), np.empty(len(used))
+    judged = _spread(len(used), most)
+    near = cKDTree(points).query(points[judged], NEIGHBOURS, workers=thread_count())[1]
+    height, unused = np.full(len(judged), np.nan), np.empty(len(judged))
     part = np.zeros(len(used), np.int32)
 
     def chunk(start: int, stop: int) -> None:
-        _residuals(normals, points, part, near[start:stop], start, ALIKE, unused[start:stop], height[start:stop])
+        here = slice(start, stop)
+        _residuals(normals, points, part, near[here], judged[here], ALIKE, unused[here], height[here])
 
-    in_chunks(chunk, len(used), _FACES_PER_CHUNK)
+    in_chunks(chunk, len(judged), _FACES_PER_CHUNK)
     return height[np.isfinite(height)]
 
 
@@ -152,7 +164,7 @@ def _solved_first(gram, p):
 
 
 @kernel
-def _residuals(normals, middles, part, near, first, alike, slope, height):
+def _residuals(normals, middles, part, near, judged, alike, slope, height):
     """Angle between each normal and what a linear fit of its neighbours' predicts, and height of each middle over their quadric.
 
     Both are divided by sqrt(1 - leverage). Coordinates lie in the plane of the neighbourhood's mean normal, so that one odd facet does
@@ -161,7 +173,7 @@ def _residuals(normals, middles, part, near, first, alike, slope, height):
     gram = np.empty((6, 7))
     row = np.empty(6)
     for i in range(len(slope)):
-        me = first + i
+        me = judged[i]
         slope[i], height[i] = np.nan, np.nan
         mx, my, mz, used = 0.0, 0.0, 0.0, 0
         for k in range(count):

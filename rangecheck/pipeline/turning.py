@@ -26,6 +26,7 @@ from rangecheck.export.video import FORMATS, find_encoder, write_film
 from rangecheck.files import read_json
 from rangecheck.maps import trace_maps
 from rangecheck.pipeline.camera import Optics, camera_of, developed, image_of, optics_of, take
+from rangecheck.pipeline.consistency import judge, write_consistency
 from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.pictures import plan_of, scene_of
 from rangecheck.pipeline.subject import Subject, read_subject
@@ -287,13 +288,15 @@ def turntable(
     frames_dir: str | None,
     materials: Sequence[str] = (),
     sheet: str | None = None,
+    consistency: bool = False,
     scheduler: str | None = None,
     force: bool,
     reporter: Reporter,
 ) -> Outcome:
     """Frames and film of one turn around what is in `path`: in one material, or in several, side by side.
 
-    Without `materials` it is the first of the settings, for stripes the first that mirrors. `sheet` is a picture of all frames."""
+    Without `materials` it is the first of the settings, for stripes the first that mirrors. `sheet` is a picture of all frames.
+    With `consistency` what the turntable shows of the surface is measured and drawn beside the frames; the outcome is its verdict."""
     film = Path(out)
     if film.suffix.lower() not in FORMATS:
         raise OutputError(out, f"must end in one of {', '.join(FORMATS)}")
@@ -325,10 +328,20 @@ def turntable(
     names = " | ".join(m.name for m in made)
     lines = [f"{out}: {orbit.frames} frames in {names}", f"frames are kept in {folder}"]
     lines += list(dict.fromkeys(line for m in made for line in m.plan))
+    judged: dict[str, Any] | None = None
+    if consistency:
+        with reporter.stage("consistency"):
+            mirrored = next((m for m in made if m.job.plan is not None and _mirrors(load_material(m.name))), None)
+            shown = () if mirrored is None else mirrored.pictures()
+            judged, said, pictures = judge(subject.surface, subject.scans, orbit, settings, shown)
+            write_consistency(folder, judged, pictures)
+        lines += said
     return Outcome(
         document("turntable", output=out, frames=[path for m in made for path in m.frames], material=names, show=settings.turntable.show,
-                 sheet=sheet, plan=[line for m in made for line in m.plan], seconds=reporter.seconds),
+                 sheet=sheet, plan=[line for m in made for line in m.plan], seconds=reporter.seconds,
+                 consistency=judged),
         lines,
+        judged is None or judged["fit"],
     )  # fmt: skip
 
 

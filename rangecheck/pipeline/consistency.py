@@ -1,0 +1,174 @@
+"""What a turntable shows of a surface, measured: speckle and jumping highlights, slope noise, outlines against the scans; and the verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rangecheck.animation import (
+    Consistency,
+    Orbit,
+    Speckle,
+    faces_seen,
+    measure_consistency,
+    outline_of,
+    speckle_of,
+    verdict_for,
+)
+from rangecheck.config import Settings
+from rangecheck.export.mapped import coloured_map
+from rangecheck.export.pictures import write_png
+from rangecheck.files import write_json
+from rangecheck.maps import Maps, trace_maps, values_seen
+from rangecheck.optics import PinholeCamera
+from rangecheck.pipeline.outcome import document
+from rangecheck.raycast import EmbreeCaster
+from rangecheck.scan import RangeScan
+from rangecheck.solid.printer import Printer, printer
+from rangecheck.surface import Surface
+
+#: views of the orbit from which it is told what was seen, and pixels across each
+VIEWS, VIEW_PX = 8, 320
+#: facets that are judged: enough for the noise to a hundredth, and for places of a few millimetres
+JUDGED = 40_000
+#: flagged places that are named
+NAMED = 10
+#: without a printer in the settings
+PRINTER = "prusa-sl1s"
+
+
+def judge(
+    surface: Surface, scans: Sequence[RangeScan], orbit: Orbit, settings: Settings, frames: Iterable[npt.NDArray[np.uint8]] = ()
+) -> tuple[dict[str, Any], list[str], list[npt.NDArray[np.uint8]]]:
+    """JSON-ready numbers, lines for people, and pictures of the flagged places from the sides that show most of them.
+
+    `frames` are pictures of the turntable in a material that mirrors."""
+    camera = PinholeCamera.from_field_of_view(VIEW_PX, VIEW_PX, settings.picture.field_of_view_deg)
+    caster = EmbreeCaster(surface.vertices, surface.faces)
+    step = max(1, orbit.frames // VIEWS)
+    poses = [orbit.world_from_camera(k) for k in range(0, orbit.frames, step)]
+    views = [trace_maps(surface, camera, pose, caster, allow_inside=True) for pose in poses]
+    # a pixel sees one facet of several; those between are seen as well
+    seen = _near_seen(surface, faces_seen(views, len(surface.faces)))
+    found = measure_consistency(surface, seen, most=JUDGED)
+    speckle = speckle_of(frames)
+    outlines = {scan.name: outline_of(surface, scan) for scan in scans}
+    machine = printer(settings.solid.printer or PRINTER)
+    height = float(np.ptp(surface.bounds_mm[:, 1]))
+    wanted = settings.solid.height_mm or height
+    said = verdict_for(found, height, wanted, machine.layer_mm, machine.pixel_mm)
+    content = _content(found, speckle, outlines, machine) | {
+        "height_mm": wanted, "fit": said.fit, "verdict": said.sentence, "views": len(views),
+    }  # fmt: skip
+    return content, _lines(found, speckle, outlines, said.sentence), _drawn(surface, found, views)
+
+
+def _near_seen(surface: Surface, seen: Any) -> Any:
+    """Faces of which a corner belongs to a face that was seen."""
+    corner = np.zeros(len(surface.vertices), bool)
+    corner[surface.faces[seen > 0]] = True
+    return corner[surface.faces].any(axis=1)
+
+
+def _content(found: Consistency, speckle: Speckle | None, outlines: dict[str, Any], machine: Printer) -> dict[str, Any]:
+    return {
+        "slope_noise_deg": found.slope_noise_deg,
+        "slope_rms_deg": found.slope_rms_deg,
+        "highlight_jump_deg": found.highlight_jump_deg,
+        "height_noise_mm": found.height_noise_mm,
+        "facets_judged": found.facets,
+        "speckle": None if speckle is None else vars(speckle),
+        "outlines": {name: vars(outline) for name, outline in outlines.items()},
+        "places": [vars(place) for place in found.places[:NAMED]],
+        "places_flagged": len(found.places),
+        "printer": machine.name,
+    }
+
+
+def _lines(found: Consistency, speckle: Speckle | None, outlines: dict[str, Any], sentence: str) -> list[str]:
+    lines = [
+        sentence,
+        f"slopes are off by {found.slope_noise_deg:.2f} degrees, so highlights jump by {found.highlight_jump_deg:.2f}; heights by "
+        f"{found.height_noise_mm:.3f} mm",
+    ]
+    if speckle is not None:
+        lines.append(
+            f"in mirrors: speckle {speckle.contrast:.1%} of the light; {speckle.pieces:.0f} pieces of highlight a frame, of which {speckle.jumps:.0%} are gone "
+            "in the next"
+        )
+    if outlines:
+        worst = max(outlines.items(), key=lambda item: item[1].worst_px)
+        missing = max(o.missing_share for o in outlines.values())
+        lines.append(
+            f"outlines: up to {missing:.2%} of a scan's cells show no surface; the worst lies {worst[1].worst_px:.1f} px off, in {worst[0]}"
+        )
+    for place in found.places[:3]:
+        x, y, z = place.centre_mm
+        lines.append(f"  stands out at ({x:.1f}, {y:.1f}, {z:.1f}) mm: {place.size_mm:.1f} mm wide, {place.peak_deg:.0f} degrees")
+    return lines
+
+
+def _drawn(surface: Surface, found: Consistency, views: Sequence[Maps]) -> list[npt.NDArray[np.uint8]]:
+    """Slope residuals in colour from the first view and the one opposite, flagged places ringed."""
+    import cv2
+
+    spread = _over_vertices(surface, found)
+    high = max(4 * found.slope_noise_deg, 1e-6)
+    pictures = []
+    for maps in (views[0], views[len(views) // 2]):
+        values = values_seen(surface, maps, spread)
+        picture = coloured_map(
+            values, "Slopes that do not fit their neighbours", "deg", low=0.0, high=high, colours="magma", picture_px=VIEW_PX
+        )
+        shown = np.array(picture)
+        top = shown.shape[0] - VIEW_PX
+        for place in found.places[:NAMED]:
+            uv, depth = maps.camera.project(_moved(maps, np.array([place.centre_mm])))
+            column, row = (round(float(c)) for c in np.nan_to_num(uv[0], nan=-1))
+            if not (0 <= column < VIEW_PX and 0 <= row < VIEW_PX):
+                continue
+            if not float(depth[0]) <= np.nan_to_num(maps.distance_mm[row, column]) + place.size_mm:
+                continue
+            left, head = _origin(shown, top)
+            cv2.circle(shown, (left + column, head + row), 7, (0, 160, 255), 2, cv2.LINE_AA)
+        pictures.append(shown)
+    return pictures
+
+
+def _origin(picture: Any, below: int) -> tuple[int, int]:
+    """Where the map begins inside its frame: as far from the left as its lower edge is from the bottom."""
+    from rangecheck.export.legend import letter_px
+
+    border = round(1.2 * letter_px(VIEW_PX))
+    return border, below - border
+
+
+def _moved(maps: Maps, points: Any) -> Any:
+    from rangecheck.rigid import inverse, move_points
+
+    return move_points(inverse(maps.world_from_camera), points)
+
+
+def _over_vertices(surface: Surface, found: Consistency) -> Any:
+    """(v,) the mean residual of the judged facets within a few facets of each vertex; the surface's level where none is near."""
+    from scipy.spatial import cKDTree
+
+    known = np.flatnonzero(np.isfinite(found.residual_deg))
+    middles = surface.triangles[known].mean(axis=1)
+    near = cKDTree(middles).query(surface.vertices, min(4, len(known)))[1].reshape(len(surface.vertices), -1)
+    return found.residual_deg[known][near].mean(axis=1)
+
+
+def write_consistency(folder: str | Path, content: dict[str, Any], pictures: Sequence[npt.NDArray[np.uint8]]) -> list[Path]:
+    """consistency.json and consistency_front.png, consistency_back.png in `folder`."""
+    where = Path(folder)
+    write_json(where / "consistency.json", document("consistency", **content))
+    paths = [where / "consistency.json"]
+    for name, picture in zip(("front", "back"), pictures):
+        paths.append(where / f"consistency_{name}.png")
+        write_png(paths[-1], picture)
+    return paths
