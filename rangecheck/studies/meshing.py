@@ -1,0 +1,173 @@
+"""Meshing: every method on the same points in the same run - error, time, memory, closedness - and where each breaks.
+
+Errors are taken against the truth: the bust's own equation, a published mesh of the same object, or the mesh that was scanned. A vertex
+counts where a sample lies within two sample spacings of it, for every method alike. Engines (open3d, MeshLab) are timed with their
+normals and nothing else, on all threads. Millimetres.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import numpy as np
+
+from rangecheck.analytic.bust import bust_distance_mm
+from rangecheck.arrays import FloatArray, IntArray
+from rangecheck.errors import InputError
+from rangecheck.scan import RangeScan
+from rangecheck.studies.bust_scans import bust_ring, near_samples, real_data, sample_scans
+from rangecheck.studies.meshing_busts import busts
+from rangecheck.studies.meshing_edges import edges
+from rangecheck.studies.meshing_growth import growth, memory
+from rangecheck.study import Candidate, Measurement, Part, SpeedChart, measure, study_of_parts
+from rangecheck.surface.meshing import fuse, grid_mesh, pivot
+from rangecheck.surface.meshing.oriented import open3d, oriented_points, spacing_of
+from rangecheck.surface.meshing.poisson import BOX_SCALE
+from rangecheck.surface.surface import Surface
+from rangecheck.surface.topology import boundary_edges
+
+
+def open3d_poisson(scans: Sequence[RangeScan], depth: int) -> Surface:
+    """open3d's screened Poisson on all threads, its normals included."""
+    engine = open3d()
+    points, normals = oriented_points(scans)
+    cloud = engine.geometry.PointCloud(engine.utility.Vector3dVector(points))
+    cloud.normals = engine.utility.Vector3dVector(normals)
+    with engine.utility.VerbosityContextManager(engine.utility.VerbosityLevel.Error):
+        mesh, _ = engine.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, scale=BOX_SCALE, n_threads=-1)
+    return _surface(np.asarray(mesh.vertices), np.asarray(mesh.triangles))
+
+
+def meshlab_poisson(scans: Sequence[RangeScan], depth: int) -> Surface:
+    """MeshLab's screened Poisson on all threads, the normals included."""
+    import os
+
+    import pymeshlab
+
+    points, normals = oriented_points(scans)
+    meshes = pymeshlab.MeshSet(verbose=False)
+    meshes.add_mesh(pymeshlab.Mesh(vertex_matrix=points, v_normals_matrix=normals))
+    meshes.generate_surface_reconstruction_screened_poisson(depth=depth, scale=BOX_SCALE, threads=os.cpu_count() or 1)
+    made = meshes.current_mesh()
+    return _surface(made.vertex_matrix(), made.face_matrix())
+
+
+def _surface(vertices: FloatArray, faces: IntArray) -> Surface:
+    surface = Surface(np.array(vertices, float), np.asarray(faces).astype(np.int32))
+    return surface.with_faces(np.arange(len(surface.faces)))
+
+
+Method = Callable[[Sequence[RangeScan]], Surface]
+
+
+def methods(depths: Sequence[int]) -> dict[tuple[str, str], Method]:
+    """Every method that takes several scans, by name and setting."""
+    found: dict[tuple[str, str], Method] = {("fuse", ""): fuse}
+    for depth in depths:
+        found["Poisson, open3d", f"depth {depth}"] = partial(open3d_poisson, depth=depth)
+        found["Poisson, MeshLab", f"depth {depth}"] = partial(meshlab_poisson, depth=depth)
+    return found | {("pivot", ""): pivot}
+
+
+def _compared(
+    scans: Sequence[RangeScan],
+    wanted: dict[tuple[str, str], Method],
+    figures_of: Callable[[Surface], dict[str, float]],
+    rounds: int,
+) -> tuple[list[Measurement], list[dict[str, object]]]:
+    """Every method on the same scans in turns, and a row for each; `figures_of` gives its errors, the chart's first."""
+    figures: list[dict[str, float]] = []
+
+    def error_of(surface: Surface) -> float:
+        figures.append(
+            figures_of(surface) | {"open_edges": float(len(boundary_edges(surface.faces))), "faces": float(len(surface.faces))}
+        )
+        return next(iter(figures[-1].values()))
+
+    candidates = [Candidate(name, setting, partial(make, scans)) for (name, setting), make in wanted.items()]
+    measured = measure(candidates, error_of, rounds=rounds)
+    rows: list[dict[str, object]] = [
+        {"method": m.method, "setting": m.setting, "seconds": m.seconds, "watertight": f["open_edges"] == 0, **f}
+        for m, f in zip(measured, figures)
+    ]
+    return measured, rows
+
+
+def _rms(scans: Sequence[RangeScan], within_mm: float, surface: Surface) -> dict[str, float]:
+    """Root mean square distance from the true bust of the vertices that samples lie near to."""
+    seen = surface.vertices[near_samples(surface.vertices, scans, within_mm)]
+    return {"rms_mm": float(np.sqrt(np.mean(bust_distance_mm(seen) ** 2))), "counted": float(len(seen))}
+
+
+def sample(quick: bool) -> Part:
+    """All methods on the eight views of the sample bust; grid, which takes one scan, on the first."""
+    scans = bust_ring(width=96) if quick else list(sample_scans())
+    within = 2 * spacing_of(scans)
+    rounds = 1 if quick else 2
+    wanted = methods((6,) if quick else (8, 9))
+    if quick:
+        wanted = {key: make for key, make in wanted.items() if key[0] != "Poisson, MeshLab"}
+    measured, rows = _compared(scans, wanted, partial(_rms, scans, within), rounds)
+    alone, more = _compared(
+        scans[:1], {("grid", "one view"): lambda s: grid_mesh(s[0])}, partial(_rms, scans[:1], within), rounds
+    )
+    poissons = [m for m in measured if m.method.startswith("Poisson")]
+    best, ours = min(poissons, key=lambda m: m.error), measured[0]
+    findings = [
+        f"sample bust, {sum(int(s.valid.sum()) for s in scans):,} points: fuse has an RMS of {ours.error:.4f} mm in {ours.seconds:.2f} s; the best "
+        f"Poisson ({best.method[9:]}, {best.setting}) {best.error:.4f} mm in {best.seconds:.2f} s: fuse takes {ours.seconds / best.seconds:.2f} of its time"
+    ]  # fmt: skip
+    return Part([_chart("sample", "Meshing the sample bust: eight views, noise 0.2 mm", "RMS over what was seen, mm", [*measured, *alone])],
+                findings + [_said(r) for r in rows + more], {"sample": rows + more})  # fmt: skip
+
+
+def bunny(quick: bool) -> Part:
+    """All methods on the ten scans of the Stanford bunny, against its published mesh."""
+    from rangecheck.scan.readers import read_scans
+    from rangecheck.surface.distance import SurfaceDistance
+    from rangecheck.surface.mesh_files import read_mesh
+
+    try:
+        folder = real_data("stanford_bunny")
+    except InputError as error:
+        return Part(findings=[f"bunny: not measured; {error}"])
+    scans = read_scans(folder / "bun.conf", unit="m")
+    published = read_mesh(folder / "bun_zipper.ply", "m")
+    vertices = published.vertices[np.unique(published.faces)]
+
+    def figures_of(surface: Surface) -> dict[str, float]:
+        distance = SurfaceDistance(surface).distance_mm(vertices)[0]
+        return {"median_mm": float(np.median(distance)), "p95_mm": float(np.quantile(distance, 0.95))}
+
+    wanted = methods((8,) if quick else (8, 9))
+    if quick:
+        wanted = {key: make for key, make in wanted.items() if key[0] in ("fuse", "Poisson, open3d")}
+    measured, rows = _compared(scans, wanted, figures_of, 1 if quick else 3)
+    theirs = next(m for m in measured if m.method == "Poisson, open3d")
+    findings = [
+        f"bunny: fuse lies {rows[0]['median_mm']:.4f} mm (median) and {rows[0]['p95_mm']:.4f} mm (95 %) from the published vertices, "
+        f"in {measured[0].seconds / theirs.seconds:.2f} of the time of open3d's Poisson, depth 8"
+    ]
+    return Part([_chart("bunny", "Meshing the Stanford bunny: ten scans", "median distance of the published vertices, mm", measured)],
+                findings + [_said(r) for r in rows], {"bunny": rows})  # fmt: skip
+
+
+def _said(row: dict[str, object]) -> str:
+    figures = ", ".join(
+        f"{k[:-3].replace('_', ' ')} {v:.4f} mm"
+        for k, v in row.items()
+        if k.endswith("_mm") and isinstance(v, float) and math.isfinite(v)
+    )
+    closed = "watertight" if row["watertight"] else f"{row['open_edges']:.0f} open edges"
+    return f"  {row['method']} {row['setting']}: {figures}, {row['seconds']:.2f} s, {closed}"
+
+
+def _chart(slug: str, title: str, error: str, measured: Sequence[Measurement]) -> SpeedChart:
+    return SpeedChart(slug, title, error, "seconds, all threads", measured)
+
+
+_PARTS = {"sample": sample, "bunny": bunny, "memory": memory, "growth": growth, "edges": edges, "busts": busts}
+PARTS = tuple(_PARTS)
+study = study_of_parts("meshing", "Meshing methods: speed, accuracy, and where each breaks", _PARTS)

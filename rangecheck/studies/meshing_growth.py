@@ -1,0 +1,84 @@
+"""What meshing takes: time and memory by the number of points, each in a process of its own, so that peaks do not hide each other."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from rangecheck.studies.bust_scans import bust_ring, sample_scans
+from rangecheck.study import Line, LineChart, Part, peak_memory_mb
+
+#: share of the cells of a view of the bust that hold a distance
+_VALID = 0.183
+
+
+def alone(work: Callable[..., dict[str, Any]], *arguments: object) -> dict[str, Any]:
+    """The result of `work(*arguments)` in a fresh process."""
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        return pool.submit(work, *arguments).result()
+
+
+def fused_alone(points: int) -> dict[str, Any]:
+    """Fuse about `points` points of the bust; how long that took and how much memory the process held, the scans included."""
+    from rangecheck.surface.meshing import fuse
+
+    scans = bust_ring(width=round(math.sqrt(points / (8 * _VALID * 0.75))))
+    fuse(bust_ring(2, width=64))  # kernels are loaded
+    before = peak_memory_mb()
+    begin = time.perf_counter()
+    surface = fuse(scans)
+    seconds = time.perf_counter() - begin
+    return {
+        "points": sum(int(s.valid.sum()) for s in scans), "seconds": seconds, "faces": len(surface.faces),
+        "peak_memory_mb": peak_memory_mb(), "before_mb": before,
+    }  # fmt: skip
+
+
+def growth(quick: bool) -> Part:
+    """Fusing more and more points of the same bust, up to five million."""
+    ladder = (5_000, 20_000) if quick else (100_000, 300_000, 1_000_000, 2_500_000, 5_000_000)
+    rows = [alone(fused_alone, points) for points in ladder]
+    points, seconds = ([float(r[key]) for r in rows] for key in ("points", "seconds"))
+    power = float(np.polyfit(np.log(points), np.log(seconds), 1)[0])
+    linear = [seconds[-1] * p / points[-1] for p in points]
+    chart = LineChart(
+        "growth", "Fusing grows with the number of points", "points", "seconds",
+        [Line("fuse", points, seconds, marked=True), Line("in proportion", points, linear)], log="xy",
+    )  # fmt: skip
+    last = rows[-1]
+    findings = [
+        f"fusing {last['points']:,} points takes {last['seconds']:.1f} s and at most {last['peak_memory_mb'] / 1000:.2f} GB, the scans and their "
+        f"making included; time grows as points^{power:.2f}"
+    ]
+    return Part([chart], findings, {"growth": rows})
+
+
+def meshed_alone(name: str, setting: str, quick: bool) -> dict[str, Any]:
+    """Mesh the sample bust by one method of `studies.meshing`; the memory that this took, beyond the scans and the packages."""
+    from rangecheck.studies.meshing import methods
+
+    scans = bust_ring(width=96) if quick else list(sample_scans())
+    make = methods((6,) if quick else (8, 9))[name, setting]
+    make(bust_ring(3, width=64))
+    before = peak_memory_mb()
+    make(scans)
+    return {"method": name, "setting": setting, "peak_memory_mb": peak_memory_mb(), "added_mb": peak_memory_mb() - before}
+
+
+def memory(quick: bool) -> Part:
+    """Peak memory of every method on the sample bust."""
+    from rangecheck.studies.meshing import methods
+
+    wanted = [("fuse", "")] if quick else list(methods((8, 9)))
+    rows = [alone(meshed_alone, name, setting, quick) for name, setting in wanted]
+    findings = [
+        f"memory, {r['method']} {r['setting']}: {r['peak_memory_mb']:.0f} MB, {r['added_mb']:.0f} of them to mesh" for r in rows
+    ]
+    return Part(findings=findings, tables={"memory": rows})
