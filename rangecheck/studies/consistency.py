@@ -27,9 +27,9 @@ PLANTED_DEG = (0.2, 0.5, 1.0, 2.0)
 #: a measured slope noise may be off by this share
 _SHARE = 0.15
 #: middle of the cheek as seen from here, and half the width of the patch, mm
-CHEEK_MM = np.array([28.0, 232.0, 0.0])
-FROM_MM = np.array([120.0, 260.0, 420.0])
-HALF_MM = 16.0
+CHEEK_MM = np.array([32.0, 189.0, 35.0])
+FROM_MM = np.array([250.0, 200.0, 330.0])
+HALF_MM = 10.0
 #: half width of the dent, mm: its depth falls to e^-1/2 there
 DENT_MM = 2.5
 #: the dent that must be found in steel
@@ -71,7 +71,10 @@ def roughened(surface: Surface, slope_deg: float, seed: int) -> Surface:
 
 
 def _slopes_part(quick: bool) -> Part:
-    surface = cheek(60 if quick else 160)
+    import trimesh
+
+    ball = trimesh.creation.icosphere(subdivisions=5 if quick else 6, radius=50.0)
+    surface = Surface(ball.vertices, ball.faces)
     rows, measured = [], []
     for planted in PLANTED_DEG:
         found = measure_consistency(roughened(surface, planted, seed=int(10 * planted)))
@@ -86,7 +89,7 @@ def _slopes_part(quick: bool) -> Part:
     lines = [Line("measured", PLANTED_DEG, measured, marked=True), Line("planted", PLANTED_DEG, PLANTED_DEG)]
     chart = LineChart(
         "slopes",
-        "Slope noise planted in the sample bust's cheek, and measured",
+        "Slope noise planted in a ball of 50 mm, and measured",
         "planted, degrees",
         "measured, degrees",
         lines,
