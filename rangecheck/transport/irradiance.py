@@ -14,21 +14,19 @@ on the surface, is `error`; noise of the two does not enter, for the product of 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from rangecheck.arrays import FloatArray, IntArray
 from rangecheck.errors import SceneError
-from rangecheck.kernels import in_chunks, inline_kernel, stage_kernel, thread_count
+from rangecheck.kernels import in_chunks, thread_count
 from rangecheck.reflectance import Material
-from rangecheck.scene.surroundings import add_surroundings
-from rangecheck.transport.chance import DIFFUSE_WAY, key_of, point, stream_of, turned
-from rangecheck.transport.geometry import frame_around
-from rangecheck.transport.irradiance_nodes import Nodes, nodes_around, nodes_of
+from rangecheck.transport.irradiance_nodes import Nodes, nodes_of
+from rangecheck.transport.irradiance_stages import look_out, look_up, mix, see_sky, stand, sum_up
 from rangecheck.transport.light import add_light, aim
-from rangecheck.transport.queues import CAMERA, KIND_NAMES, LOBE, new_hits, new_rays, new_shadows
+from rangecheck.transport.queues import KIND_NAMES, LOBE, new_hits, new_rays, new_shadows
 from rangecheck.transport.reflection import materials_of
 
 if TYPE_CHECKING:
@@ -76,6 +74,12 @@ class IrradianceCache:
     rays: int
     reflections: int
     met: bool
+
+    def in_one_channel(self, channel: int) -> IrradianceCache:
+        """The same at one wavelength."""
+        one = slice(channel, channel + 1)
+        light = np.ascontiguousarray(self.stored.light[:, one])
+        return replace(self, stored=self.stored._replace(light=light, albedo=np.ascontiguousarray(self.stored.albedo[:, one])))
 
     def explain(self) -> str:
         """One line for people."""
@@ -183,7 +187,7 @@ class _Gathering:
             hits = new_hits(stop - start, self.channels)
             shadows = new_shadows((stop - start) * sources * max(1, self.shadow_rays), self.channels)
             with np.errstate(over="ignore"):
-                _stand(self.place[start:stop], self.normal[start:stop], tracer.geometry.skin, self.seed, start, hits)
+                stand(self.place[start:stop], self.normal[start:stop], tracer.geometry.skin, self.seed, start, hits)
                 k = aim(tracer.sources, white, hits, 0, stop - start, self.shadow_rays, True, False, shadows)
             tracer.caster.occluded_local(
                 shadows.origin[:k], shadows.direction[:k], shadows.far[:k], shadows.blocked[:k], coherent=True
@@ -248,12 +252,12 @@ class _Gathering:
             queue = new_rays((stop - start) * rays, self.channels)
             own = slice(start * rays, stop * rays)
             with np.errstate(over="ignore"):
-                _look_out(
+                look_out(
                     place[start:stop], normal[start:stop], tracer.geometry.skin, rays, seed & 0xFFFFFFFF, first + start, queue
                 )
             face, u, v = met.face[own], met.u[own], met.v[own]
             tracer.caster.closest_local(queue.origin, queue.direction, queue.far, face, u, v)
-            _see_sky(sky, tracer.geometry.normals, tracer.geometry.corners, queue, rays, self.sides, face, met.sky[start:stop])
+            see_sky(sky, tracer.geometry.normals, tracer.geometry.corners, queue, rays, self.sides, face, met.sky[start:stop])
 
         in_chunks(some, n, max(1, _RECORDS_AT_ONCE * RAYS // rays))
         return met
@@ -266,7 +270,7 @@ class _Gathering:
 
         def some(start: int, stop: int) -> None:
             own = slice(start * met.rays, stop * met.rays)
-            _sum_up(
+            sum_up(
                 self.node_of_face, self.steps, total, self.albedo, materials, len(total) // self.sides, met.rays,
                 met.face[own], met.u[own], met.v[own], met.sky[start:stop], seen[start:stop],
             )  # fmt: skip
@@ -291,7 +295,7 @@ class _Gathering:
         normal *= np.where(back, -1, 1)[:, None] / np.linalg.norm(normal, axis=1, keepdims=True)
         normal = np.ascontiguousarray(normal, np.float32)
         kept, straight = (np.empty((places, self.channels), np.float32) for _ in range(2))
-        _look_up(stored, self.direct, face, u, v, back, kept, straight)
+        look_up(stored, self.direct, face, u, v, back, kept, straight)
         gaps = [
             self._sum(self._look(place, normal, _PILOT_RAYS, self.seed + 0x5EED + k), stored.light) - kept if self.depth > 1
             else self._look(place, normal, _PILOT_RAYS, self.seed + 0x5EED + k).sky - kept
@@ -341,118 +345,5 @@ def _is_closed(faces: IntArray) -> bool:
 def _interpolated(near: IntArray, weight: FloatArray, light: FloatArray) -> FloatArray:
     """(n, c) float32 at the nodes of (records, c) at the records."""
     result = np.empty((len(near), light.shape[1]), np.float32)
-    in_chunks(lambda start, stop: _mix(near[start:stop], weight[start:stop], light, result[start:stop]), len(near), 32768)
+    in_chunks(lambda start, stop: mix(near[start:stop], weight[start:stop], light, result[start:stop]), len(near), 32768)
     return result
-
-
-@stage_kernel
-def _mix(near, weight, light, result):
-    for i in range(len(near)):
-        for c in range(light.shape[1]):
-            total = 0.0
-            for k in range(near.shape[1]):
-                total += weight[i, k] * light[near[i, k], c]
-            result[i, c] = total
-
-
-@stage_kernel
-def _stand(place, normal, skin, seed, first, hits):
-    """Nodes as hits that somebody sees who looks along their normals."""
-    for i in range(len(place)):
-        for axis in range(3):
-            hits.place[i, axis] = place[i, axis] + skin * normal[i, axis]
-            hits.shading[i, axis] = hits.facing[i, axis] = normal[i, axis]
-            hits.arriving[i, axis] = -normal[i, axis]
-        for c in range(hits.weight.shape[1]):
-            hits.weight[i, c] = 1.0
-        hits.pixel[i], hits.first[i], hits.material[i] = i, CAMERA, 0
-        hits.stream[i], hits.number[i] = stream_of(seed, first + i), 0
-
-
-@stage_kernel
-def _look_out(place, normal, skin, count, seed, first, rays):
-    """`count` rays from each place, spread evenly by their cosine; each carries its share of the hemisphere's light."""
-    k = np.int64(0)
-    for i in range(len(place)):
-        nx, ny, nz = float(normal[i, 0]), float(normal[i, 1]), float(normal[i, 2])
-        ax, ay, az, bx, by, bz = frame_around(nx, ny, nz)
-        key = key_of(stream_of(seed, first + i), DIFFUSE_WAY)
-        for j in range(count):
-            p, q = point(key, j)
-            aside, up = math.sqrt(p), math.sqrt(1.0 - p)
-            cos_turn, sin_turn = turned(q)
-            e, f = aside * cos_turn, aside * sin_turn
-            rays.direction[k, 0] = e * ax + f * bx + up * nx
-            rays.direction[k, 1] = e * ay + f * by + up * ny
-            rays.direction[k, 2] = e * az + f * bz + up * nz
-            for axis in range(3):
-                rays.origin[k, axis] = place[i, axis] + skin * normal[i, axis]
-            rays.far[k] = math.inf
-            for c in range(rays.weight.shape[1]):
-                rays.weight[k, c] = 1.0 / count
-            k += 1
-
-
-@inline_kernel
-def seen_from_behind(corners, normals, face, dx, dy, dz):
-    """Whether a ray meets the side of a face that its corners' normals turn away from."""
-    ex, ey, ez = corners[face, 3] - corners[face, 0], corners[face, 4] - corners[face, 1], corners[face, 5] - corners[face, 2]
-    fx, fy, fz = corners[face, 6] - corners[face, 0], corners[face, 7] - corners[face, 1], corners[face, 8] - corners[face, 2]
-    gx, gy, gz = ey * fz - ez * fy, ez * fx - ex * fz, ex * fy - ey * fx
-    out = gx * normals[face, 0] + gy * normals[face, 1] + gz * normals[face, 2]
-    return (gx * dx + gy * dy + gz * dz > 0.0) == (out > 0.0)
-
-
-@stage_kernel
-def _see_sky(surroundings, normals, corners, rays, count, sides, faces, light):
-    """Add what rays see of the surroundings to their records; mark back sides."""
-    sky, frame, period, softness, low, high, picture, boxes, glow = surroundings
-    for k in range(len(faces)):
-        face = np.int64(faces[k])
-        dx, dy, dz = float(rays.direction[k, 0]), float(rays.direction[k, 1]), float(rays.direction[k, 2])
-        if face < 0:
-            add_surroundings(
-                sky, frame, period, softness, low, high, picture, boxes, glow, dx, dy, dz, rays.weight, k, light, k // count
-            )  # fmt: skip
-        elif seen_from_behind(corners, normals, face, dx, dy, dz):
-            faces[k] = -2 - face
-
-
-@stage_kernel
-def _sum_up(node_of_face, steps, light, albedo, materials, nodes, count, faces, us, vs, sky, seen):
-    """Light that records see: of the surroundings, and of the places that their rays met.
-
-    The back side of a closed surface is met only by rays that start below the faces of a rounded edge; they are left out."""
-    back = nodes if len(light) > nodes else np.int64(0)
-    k = np.int64(0)
-    for i in range(len(seen)):
-        left_out = 0
-        for c in range(seen.shape[1]):
-            seen[i, c] = 0.0
-        for _ in range(count):
-            face, shift = np.int64(faces[k]), np.int64(0)
-            if face < -1:
-                face, shift = -2 - face, back
-                if back == 0:
-                    left_out += 1
-                    face = np.int64(-1)
-            if face >= 0:
-                a, b, d, p, q, r = nodes_around(node_of_face, steps, face, float(us[k]), float(vs[k]))
-                for c in range(seen.shape[1]):
-                    white = p * light[a + shift, c] + q * light[b + shift, c] + r * light[d + shift, c]
-                    seen[i, c] += albedo[materials[face], c] * white
-            k += 1
-        for c in range(seen.shape[1]):
-            seen[i, c] = (sky[i, c] * count + seen[i, c]) / max(count - left_out, 1)
-
-
-@stage_kernel
-def _look_up(stored, direct, face, u, v, back, kept, straight):
-    """Stored and direct light at places of faces."""
-    nodes = len(stored.light) // stored.sides
-    for i in range(len(face)):
-        shift = nodes if back[i] else np.int64(0)
-        a, b, d, p, q, r = nodes_around(stored.node_of_face, stored.steps, face[i], u[i], v[i])
-        for c in range(kept.shape[1]):
-            kept[i, c] = p * stored.light[a + shift, c] + q * stored.light[b + shift, c] + r * stored.light[d + shift, c]
-            straight[i, c] = p * direct[a + shift, c] + q * direct[b + shift, c] + r * direct[d + shift, c]

@@ -94,7 +94,7 @@ class OutsideRenderer:
 
 
 def outside_variants() -> list[tuple[str, str]]:
-    """(variant, sampler) that can be used here, the fastest first: those compiled by LLVM only where their library loads.
+    """(variant, sampler) that are worth using here: those compiled by LLVM where its library loads, else the scalar one, half as fast.
 
     The library is tried in another process, for one of a wrong version ends the process that it is loaded into."""
     tried = "import mitsuba; mitsuba.set_variant('llvm_ad_mono'); import drjit; print(float(drjit.llvm.ad.Float(2)[0] * 2))"
@@ -102,8 +102,9 @@ def outside_variants() -> list[tuple[str, str]]:
         proof = subprocess.run([sys.executable, "-c", tried], capture_output=True, text=True, timeout=120, check=False).stdout
     except (OSError, subprocess.TimeoutExpired):
         proof = ""
-    compiled = [("llvm_ad_mono", "independent"), ("llvm_ad_mono", "multijitter")] if proof.strip() == "4.0" else []
-    return [*compiled, ("scalar_rgb", "independent")]
+    if proof.strip() == "4.0":
+        return [("llvm_ad_mono", "independent"), ("llvm_ad_mono", "multijitter")]
+    return [("scalar_rgb", "independent")]
 
 
 def _colour(values: FloatArray) -> dict[str, Any]:

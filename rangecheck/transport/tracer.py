@@ -56,6 +56,7 @@ class Tracer:
         self.lights = (*(f"source {k}" for k in range(len(scene.sources))), "surroundings")
         self._idle: list[Workspace] = []
         self._grey: Tracer | None = None
+        self._coloured: Tracer | None = None
         self._kept: dict[tuple[int, int], IrradianceCache] = {}
         self._keeping = Lock()
 
@@ -69,7 +70,8 @@ class Tracer:
         twin.surroundings = twin.scene.surroundings.arrays(1)
         twin.materials = materials_of(twin.scene.materials)
         twin._idle, twin._kept, twin._keeping = [], {}, Lock()
-        twin._grey = self._grey = twin
+        twin._grey, twin._coloured = twin, self
+        self._grey = twin
         return twin
 
     def irradiance(self, depth: int, records: int) -> IrradianceCache:
@@ -77,7 +79,11 @@ class Tracer:
         picture of the scene. Raises SceneError where something shines."""
         with self._keeping:
             if (depth, records) not in self._kept:
-                self._kept[depth, records] = gather_irradiance(self, depth=depth, error=KEPT_ERROR, records=records)
+                if self._coloured is not None:
+                    kept = self._coloured.irradiance(depth, records).in_one_channel(self._coloured.scene.channels // 2)
+                else:
+                    kept = gather_irradiance(self, depth=depth, error=KEPT_ERROR, records=records)
+                self._kept[depth, records] = kept
             return self._kept[depth, records]
 
     def _stored(self, settings: Settings) -> Stored:

@@ -1,0 +1,286 @@
+"""What a picture costs: beside the bare casting of its rays, beside an outside renderer (Mitsuba 3), and with its number of pixels.
+
+Errors are root mean squares over the pixels that see the object, relative to their mean radiance, each renderer's against its own
+converged picture. That picture is taken in two independent halves: the mean of the product of the two differences holds the error of
+the picture that is judged and nothing of the noise of the halves, so that they need not be endless.
+
+`DRJIT_LIBLLVM_PATH` says where Mitsuba finds LLVM; without it its scalar variant, half as fast, takes part.
+"""
+
+from __future__ import annotations
+
+import resource
+import statistics
+import sys
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import count
+from multiprocessing import get_context
+from typing import Any
+
+import numpy as np
+
+from rangecheck.arrays import BoolArray, FloatArray
+from rangecheck.errors import DependencyMissing
+from rangecheck.optics import PinholeCamera
+from rangecheck.reflectance import GREY_UM, Material, load_material
+from rangecheck.scene import Scene, constant, gradient
+from rangecheck.studies.scenes import LAMPS, bust_relief, view
+from rangecheck.study import Line, LineChart, Part, study_of_parts
+from rangecheck.surface import Surface
+from rangecheck.transport import DIRECT, Settings, Tracer, render_to
+from rangecheck.transport.benchmark import cast_ratio
+from rangecheck.transport.outside import OutsideRenderer, outside_variants
+
+PLASTER = Material("plaster", K_lm=0.9, wavelengths_um=GREY_UM)
+#: the rough limit without a spike, which is what Mitsuba's rough conductor is
+ROUGH_STEEL = Material("rough steel", K_s=0.6, sigma_um=2.0, correlation_um=20.0, bounded=False, wavelengths_um=GREY_UM)
+#: the lobe and one interreflection
+ONE_MORE = Settings(centre=True, shadow_rays=0, diffuse=False, depth=2, backdrop=False)
+#: the error that both renderers are timed to
+GOAL = 0.01
+#: samples in one call of the outside renderer; more need gigabytes
+_AT_ONCE = 16
+
+
+def _bust(quick: bool) -> Surface:
+    return bust_relief(100, 120) if quick else bust_relief(480, 576)
+
+
+def _ratios(quick: bool) -> Part:
+    """A frame's time over that of casting its very rays."""
+    surface = _bust(quick)
+    rows: list[dict[str, Any]] = []
+    camera, pose = view(64 if quick else 720)
+    plaster = Tracer(Scene(surface, (PLASTER,), sources=LAMPS, smooth=True))
+    steel = Tracer(
+        Scene(surface, (load_material("steel").at(GREY_UM),), sources=LAMPS[:1], surroundings=gradient(0.05, 0.5), smooth=True)
+    )
+    satin = Tracer(replace(steel.scene, materials=(load_material("steel_satin").at(GREY_UM),)))
+    cases = (
+        ("plaster, light straight from two sources", plaster, DIRECT),
+        ("plaster, soft shadows, 2 samples a pixel", plaster, replace(DIRECT, centre=False, each=2, shadow_rays=1)),
+        ("polished steel, lobe and one interreflection", steel, ONE_MORE),
+        ("satin steel, lobe and one interreflection", satin, ONE_MORE),
+    )
+    for name, tracer, settings in cases:
+        found = cast_ratio(tracer, camera, pose, settings, repeats=3 if quick else 15)
+        rows.append({"picture": name, "frame_s": found.frame_s, "cast_s": found.cast_s, "rays": found.rays, "ratio": found.ratio})
+    said = [
+        f"{row['picture']}: {1e3 * row['frame_s']:.0f} ms, {row['ratio']:.2f} times the bare cast of its {row['rays']:,} rays"
+        for row in rows
+    ]
+    return Part((), said, {"cast_ratios": rows})
+
+
+@dataclass(frozen=True)
+class Racer:
+    """picture(effort, seed) (h, w); effort grows by `step` until the goal is met; `halves` are its converged picture, twice."""
+
+    name: str
+    picture: Callable[[float, int], FloatArray]
+    start: float
+    step: float
+    last: float
+    halves: tuple[FloatArray, FloatArray]
+    ready_s: float
+    unit: str
+
+
+def crossed(picture: FloatArray, halves: tuple[FloatArray, FloatArray], where: BoolArray) -> float:
+    """Root mean square error over `where`, relative to the mean there, free of the noise of the two halves."""
+    first, second = (picture[where].astype(np.float64) - half[where] for half in halves)
+    mean = float(halves[0][where].mean(dtype=np.float64) + halves[1][where].mean(dtype=np.float64)) / 2
+    return float(np.sqrt(max(float((first * second).mean()), 0.0))) / mean
+
+
+def run_to(racer: Racer, where: BoolArray, goal: float) -> tuple[list[dict[str, Any]], float]:
+    """Efforts and their errors up to the first below the goal, and the effort that meets it, between the last two on a straight line in
+    logarithms; NaN if none does."""
+    rows: list[dict[str, Any]] = []
+    effort = racer.start
+    while (effort - racer.last) * (racer.step - 1) <= 0:
+        begin = time.perf_counter()
+        picture = racer.picture(effort, 1000)
+        error = crossed(picture, racer.halves, where)
+        rows.append({"renderer": racer.name, "effort": effort, "error": error, "seconds": time.perf_counter() - begin})
+        if error <= goal:
+            break
+        effort *= racer.step
+    else:
+        return rows, float("nan")
+    if len(rows) == 1:
+        return rows, effort
+    (e0, x0), (e1, x1) = ((row["error"], row["effort"]) for row in rows[-2:])
+    share = np.log(goal / e0) / np.log(e1 / e0)
+    return rows, float(x0 * (x1 / x0) ** share)
+
+
+def _outside_racers(scene: Scene, size: int, depth: int, halves: int, variants: Sequence[tuple[str, str]]) -> list[Racer]:
+    camera, pose = view(size)
+    racers: list[Racer] = []
+    reference: tuple[FloatArray, FloatArray] | None = None
+    for variant, sampler in variants:
+        begin = time.perf_counter()
+        outside = OutsideRenderer(scene, camera, pose, depth=depth, variant=variant, sampler=sampler)
+        outside.render(_AT_ONCE, seed=1)
+        ready = time.perf_counter() - begin
+
+        def picture(effort: float, seed: int, outside: OutsideRenderer = outside) -> FloatArray:
+            return _in_calls(outside, round(effort), seed)
+
+        if reference is None:
+            reference = (picture(halves, 50_000), picture(halves, 60_000))
+        racers.append(Racer(f"mitsuba {variant} {sampler}", picture, 4, 2.0, 2048, reference, ready, "samples a pixel"))
+    return racers
+
+
+def _in_calls(outside: OutsideRenderer, samples: int, seed: int) -> FloatArray:
+    """(h, w) mean of calls of at most `_AT_ONCE` samples."""
+    total, left = np.zeros(1), samples
+    for number in count():
+        if left <= 0:
+            return np.asarray(total / samples)
+        now = min(left, _AT_ONCE)
+        total = total + now * outside.render(now, seed=seed + number)[..., 0]
+        left -= now
+    raise AssertionError
+
+
+def _our_racer(scene: Scene, size: int, settings: Settings, halves: int) -> tuple[Racer, BoolArray]:
+    camera, pose = view(size)
+    begin = time.perf_counter()
+    tracer = Tracer(scene)
+    tracer.render(camera, pose, settings)
+    ready = time.perf_counter() - begin
+    films = [tracer.render(camera, pose, replace(settings, passes=max(1, halves // 4), each=4), seed=seed) for seed in (91, 92)]
+
+    def picture(error: float, seed: int) -> FloatArray:
+        return render_to(tracer, camera, pose, settings, error, seed=seed).radiance[..., 0]
+
+    reference = (films[0].radiance[..., 0], films[1].radiance[..., 0])
+    where = (films[0].coverage > 0) & (films[1].coverage > 0)
+    return Racer("rangecheck", picture, 0.08, 0.5**0.5, 1e-4, reference, ready, "error aimed at"), where
+
+
+def _race(name: str, scene: Scene, settings: Settings, wanted: float, quick: bool) -> Part:
+    """Seconds to an error of one percent, in one run, in turns."""
+    short = name.split(",")[0]
+    size, halves, goal = (32, 32, 0.1) if quick else (512, 256, GOAL)
+    ours, where = _our_racer(scene, size, settings, halves)
+    variants = [("scalar_rgb", "independent")] if quick else outside_variants()
+    racers = [ours, *_outside_racers(scene, size, settings.depth, halves, variants)]
+    table, efforts = [], []
+    for racer in racers:
+        rows, effort = run_to(racer, where, goal)
+        table += rows
+        efforts.append(effort)
+    times: list[list[float]] = [[] for _ in racers]
+    for repeat in range(1 if quick else 3):
+        for index, racer in enumerate(racers):
+            if np.isfinite(efforts[index]):
+                begin = time.perf_counter()
+                racer.picture(efforts[index], repeat)
+                times[index].append(time.perf_counter() - begin)
+    seconds = [statistics.median(t) if t else float("nan") for t in times]
+    said = [
+        f"{name}, {size}x{size}: {racer.name} reaches {100 * goal:g} % in {t:.3g} s at {effort:.3g} {racer.unit}; "
+        f"{t / seconds[0]:.1f} times ours; made ready, first picture included, in {racer.ready_s:.2g} s"
+        for racer, t, effort in zip(racers, seconds, efforts)
+    ]
+    best = np.nanmin(seconds[1:])
+    said.append(f"{name}: Mitsuba's best setting takes {best / seconds[0]:.1f} times as long as ours; {wanted:g} was wanted")
+    lines = [
+        Line(racer.name, [r["seconds"] for r in mine], [r["error"] for r in mine], marked=True)
+        for racer in racers
+        if (mine := [row for row in table if row["renderer"] == racer.name])
+    ]
+    chart = LineChart(
+        f"race-{short}", f"{name}: time against error", "seconds", "error over the object", lines, log="xy", level=goal
+    )
+    return Part((chart,), said, {f"race_{short}": table})
+
+
+def _plaster(quick: bool) -> Part:
+    scene = Scene(_bust(quick), (PLASTER,), sources=LAMPS)
+    settings = Settings(shadow_rays=1, spike=False, lobe=False, diffuse=False, depth=1)
+    return _race("plaster, two spherical sources", scene, settings, 10, quick)
+
+
+def _steel(quick: bool) -> Part:
+    scene = Scene(_bust(quick), (ROUGH_STEEL,), sources=LAMPS, surroundings=constant(0.3))
+    return _race(
+        "steel, one interreflection", scene, Settings(shadow_rays=1, spike=False, diffuse=False, depth=2, backdrop=True), 5, quick
+    )
+
+
+def _scaling(quick: bool) -> Part:
+    """Seconds and peak memory of pictures of growing size, each in a process of its own."""
+    sizes = (32, 64) if quick else (256, 512, 1024, 2048)
+    rows: list[dict[str, Any]] = []
+    for name in ("plaster", "steel"):
+        for size in sizes:
+            with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+                rows.append({"material": name, "size": size, **pool.submit(_one_size, name, size, quick).result()})
+    lines = [
+        Line(
+            name,
+            [r["size"] ** 2 for r in rows if r["material"] == name],
+            [r["seconds"] for r in rows if r["material"] == name],
+            marked=True,
+        )
+        for name in ("plaster", "steel")
+    ]
+    said = []
+    for line in lines:
+        exponent = float(np.polyfit(np.log(line.x), np.log(line.y), 1)[0])
+        most = max(row["peak_gb"] for row in rows if row["material"] == line.label)
+        said.append(
+            f"{line.label}: time grows with the {exponent:.2f}th power of pixels from {sizes[0]}^2 to {sizes[-1]}^2, "
+            f"{1e9 * line.y[-1] / line.x[-1]:.0f} ns a pixel at the largest; peak memory {most:.2f} GB"
+        )
+    chart = LineChart("scaling", "Time against pixels", "pixels", "seconds", lines, log="xy")
+    return Part((chart,), said, {"scaling": rows})
+
+
+def _one_size(name: str, size: int, quick: bool) -> dict[str, float]:
+    """In a process of its own: median seconds of a picture, peak memory in GB (10^9 bytes), and that before the picture."""
+    scene = (
+        Scene(_bust(quick), (PLASTER,), sources=LAMPS, smooth=True)
+        if name == "plaster"
+        else Scene(_bust(quick), (load_material("steel"),), sources=LAMPS[:1], surroundings=gradient(0.05, 0.5), smooth=True)
+    )
+    settings = DIRECT if name == "plaster" else ONE_MORE
+    tracer = Tracer(scene)
+    camera, pose = view(size)
+    tracer.render(PinholeCamera.from_field_of_view(64, 64, 26.0), pose, settings)
+    before = _peak_gb()
+    times = []
+    for _ in range(3 if size > 1024 else 7):
+        begin = time.perf_counter()
+        tracer.render(camera, pose, settings)
+        times.append(time.perf_counter() - begin)
+    return {"seconds": statistics.median(times), "peak_gb": _peak_gb(), "before_gb": before}
+
+
+def _peak_gb() -> float:
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak * (1.0 if sys.platform == "darwin" else 1024.0) / 1e9
+
+
+def _guarded(part: Callable[[bool], Part], quick: bool) -> Part:
+    """The part, or why it cannot be made here."""
+    try:
+        return part(quick)
+    except DependencyMissing as missing:
+        return Part((), [str(missing)], {})
+
+
+_PARTS: dict[str, Callable[[bool], Part]] = {
+    "cast": _ratios, "plaster": partial(_guarded, _plaster), "steel": partial(_guarded, _steel), "scaling": _scaling,
+}  # fmt: skip
+PARTS = tuple(_PARTS)
+study = study_of_parts("renderers", "What a picture costs: beside casting, beside Mitsuba, and by its size", _PARTS)
