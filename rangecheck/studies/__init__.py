@@ -19,6 +19,7 @@ STUDIES = {
     "pictures": "rangecheck.studies.pictures",
     "meshing": "rangecheck.studies.meshing",
     "reflectance": "rangecheck.studies.reflectance",
+    "registration": "rangecheck.studies.registration",
     "transport": "rangecheck.studies.transport",
     "rays": "rangecheck.studies.rays",
     "renderers": "rangecheck.studies.renderers",

@@ -45,6 +45,19 @@ def bust_ring(
     views: int = 8, *, width: int = 320, noise_mm: float = 0.2, step_mm: float = 0.02, seed: int = 7, lost_share: float = 0.0
 ) -> list[RangeScan]:
     """`views` scans around the sample bust by the sample finder with these changes, `width` by 3/4 `width` cells each."""
+    poses = ring_of_poses(views, DISTANCE_MM, target_mm=TARGET_MM, elevations_deg=(-12.0, 38.0))
+    return _scanned(poses, width, noise_mm, step_mm, seed, lost_share)
+
+
+def bust_views(azimuths_deg: Sequence[float], *, width: int = 320, noise_mm: float = 0.2, seed: int = 7) -> list[RangeScan]:
+    """Level scans of the sample bust from these azimuths."""
+    poses = [ring_of_poses(1, DISTANCE_MM, target_mm=TARGET_MM, first_deg=azimuth)[0] for azimuth in azimuths_deg]
+    return _scanned(poses, width, noise_mm, 0.02, seed, 0.0)
+
+
+def _scanned(
+    poses: Sequence[FloatArray], width: int, noise_mm: float, step_mm: float, seed: int, lost_share: float
+) -> list[RangeScan]:
     from rangecheck.raycast.implicit import ImplicitCaster
 
     height = width * 3 // 4
@@ -52,7 +65,6 @@ def bust_ring(
     finder = RangeFinder(
         source_mm=(150.0, 0.0, 0.0), working_distance_mm=DISTANCE_MM, noise_mm=noise_mm, step_mm=step_mm, lost_share=lost_share
     )
-    poses = ring_of_poses(views, DISTANCE_MM, target_mm=TARGET_MM, elevations_deg=(-12.0, 38.0))
     caster = ImplicitCaster.of_bust()
     return [simulate_scan(caster, camera, p, finder, seed, scan_index=k, name=f"view_{k}").scan for k, p in enumerate(poses)]
 

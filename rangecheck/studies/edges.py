@@ -87,7 +87,7 @@ def highlights_part(quick: bool) -> Part:
     """Scatter and number of pieces of steel's highlights against the tilt of facets, on a ball and on the bust."""
     size, samples = (64, 5) if quick else (256, 13)
     edges, lines, rows, said = [], [], [], []
-    subjects: dict[str, Callable[[], Surface]] = {"ball": partial(ball, 5), "bust": bust_relief}
+    subjects: dict[str, Callable[[], Surface]] = {"ball": partial(ball, 5 if quick else 6), "bust": bust_relief}
     for name, make in subjects.items():
         made = _Highlights(make(), size)
         edge = find_edge(f"{name}, steel", made.scatter, 0.02, 20.0, BROKEN, logarithmic=True, samples=samples, tolerance=0.05)

@@ -9,7 +9,6 @@ of the two differences is free of their noise. Twice its standard error is added
 from __future__ import annotations
 
 import math
-from copy import copy
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -17,13 +16,13 @@ import numpy as np
 from rangecheck.arrays import FloatArray, IntArray
 from rangecheck.errors import SettingError
 from rangecheck.optics import Camera
-from rangecheck.reflectance import MaterialTables
 from rangecheck.reflectance.fast import FAST_ERROR
-from rangecheck.reflectance.forms import form_error, with_forms
+from rangecheck.reflectance.forms import form_error
 from rangecheck.scene import Scene
 from rangecheck.transport.adaptive import render_to
 from rangecheck.transport.camera_rays import PictureRays, pixel_order
-from rangecheck.transport.film import Film, Plate
+from rangecheck.transport.even import render_evenly, with_lobe_forms
+from rangecheck.transport.film import Film
 from rangecheck.transport.settings import REPORT, Settings
 from rangecheck.transport.tracer import Tracer
 
@@ -33,6 +32,8 @@ MODELS = ("plan", "full", "report")
 
 #: share of the tolerance that one thing left out may cost, and that all together may
 _EACH_SHARE, _ALL_SHARE = 0.2, 0.5
+#: share that everything left out and interpolation of kept light may cost together: the noise that this saves is worth more
+_CACHE_SHARE = 0.8
 #: the estimate of the remaining noise is asked to stay this far below what is left
 _NOISE_SHARE = 0.8
 _PILOT_PIXELS, _PILOT_PASSES = 2048, 8
@@ -40,8 +41,6 @@ _PILOT_PIXELS, _PILOT_PASSES = 2048, 8
 _FORM_WORTH_A_TRY = 0.1
 _DEPTHS = (1, 2, 3, 4, 6, 10, 16)
 _FULL_DEPTH = 64
-#: observations of a pixel that `full` takes in one go
-_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
@@ -109,7 +108,7 @@ def render(
 ) -> Film:
     """The picture by its plan (made here unless given). Same bytes on any number of threads."""
     plan = plan or make_plan(tracer, camera, world_from_camera, tolerance=tolerance, seed=seed)
-    work = _formed(tracer.grey() if plan.grey else tracer, plan.forms)
+    work = with_lobe_forms(tracer.grey() if plan.grey else tracer, plan.forms)
     if plan.error is None:
         film = work.render(camera, world_from_camera, plan.settings, seed=seed)
     elif plan.model == "full":
@@ -117,46 +116,6 @@ def render(
     else:
         film = render_to(work, camera, world_from_camera, plan.settings, plan.error, seed=seed)
     return film.in_channels(tracer.scene.channels) if plan.grey else film
-
-
-def render_evenly(
-    tracer: Tracer,
-    camera: Camera,
-    world_from_camera: FloatArray,
-    settings: Settings,
-    error: float,
-    *,
-    seed: int = 0,
-    most: int = 1 << 18,
-) -> Film:
-    """The same number of samples in every pixel, as many as bring the frame's standard error to `error` of its mean."""
-    picture, pixels = tracer.picture_rays(camera, world_from_camera), pixel_order(camera.width, camera.height)
-    plate = Plate(camera.height, camera.width, tracer.scene.channels)
-    tally = np.zeros(())
-    done, passes = 0, 4
-    while True:
-        while done < passes:
-            step = min(_AT_ONCE, passes - done)
-            tally = tally + tracer.expose(picture, pixels, settings, seed, plate, done, step)
-            done += step
-        film = plate.develop(tally / (passes * len(pixels)), tracer.lights, plate.count * np.int32(settings.each))
-        mean = film.mean_radiance
-        if not mean > 0 or passes * settings.each >= most:
-            return film
-        ratio = film.standard_error() / (error * mean)
-        if ratio <= 1:
-            return film
-        passes = min(max(passes + 1, math.ceil(passes * min(ratio * ratio, 4.0))), max(1, most // settings.each))
-
-
-def _formed(tracer: Tracer, forms: tuple[str, ...]) -> Tracer:
-    """The same scene, its lobes evaluated by these forms."""
-    if not forms or set(forms) == {"fast"}:
-        return tracer
-    twin = copy(tracer)
-    tables = with_forms(MaterialTables(tracer.materials.surfaces, tracer.materials.series), forms)
-    twin.materials = tracer.materials._replace(surfaces=tables.surfaces)
-    return twin
 
 
 _REPORT_REASONS = (
@@ -193,6 +152,7 @@ class _Planner:
         self._shadows()
         self._reflections()
         self._depth()
+        self._irradiance()
         self._branches()
         self._lobe_forms()
         grey = self._grey()
@@ -207,7 +167,7 @@ class _Planner:
         """(n, c) radiance of the pilot's pixels, twice, with independent chance."""
         settings = replace(settings, passes=_PILOT_PASSES, each=1, centre=False)
         first, second = (
-            _formed(self.tracer, self.forms)
+            with_lobe_forms(self.tracer, self.forms)
             .probe(self.picture, self.pixels, settings, self.seed + 0x5EED + k)
             .mean(axis=0, dtype=np.float64)
             for k in (0, 1)
@@ -294,10 +254,33 @@ class _Planner:
                 return
         self.reasons.append(f"depth: {_FULL_DEPTH} reflections; {_DEPTHS[-1]} would leave an error of {_percent(cost)}")
 
+    def _irradiance(self) -> None:
+        """Diffuse interreflection looked up where it is kept on the surfaces, if interpolation is good enough; else followed path by path."""
+        if not self.settings.diffuse or self.tracer.materials.shiny.any() or not hasattr(self.tracer, "irradiance"):
+            return
+        kept = self.tracer.irradiance(self.settings.depth, self.settings.records)
+        without = self._look(replace(self.settings, diffuse=False))
+        gathered = 0.5 * (self.seen[0] - without[0] + self.seen[1] - without[1])
+        covered = max(float((gathered > 0).mean()), 1e-3)
+        # the cache's error is relative to the light on the surfaces; a frame also has its background
+        cost = kept.error * float(gathered.mean()) / self.mean / math.sqrt(covered)
+        allowed = _CACHE_SHARE * self.tolerance - self.spent
+        seen = self._look(replace(self.settings, gather_diffuse="cache"))
+        gap = 0.5 * (seen[0] - self.seen[0] + seen[1] - self.seen[1])
+        shift, sure = abs(float(gap.mean())) / self.mean, 3.0 * float(gap.std()) / math.sqrt(gap.size) / self.mean
+        said = f"{kept.explain()}; {_percent(cost)} of the picture, its mean {_percent(shift)} from the paths' (known to {_percent(sure)})"
+        if cost <= allowed and shift <= sure + allowed:
+            self.settings, self.seen = replace(self.settings, gather_diffuse="cache"), seen
+            self.spent += cost
+            self.reasons.append(f"diffuse light: looked up; {said}; {_percent(allowed)} was allowed")
+        else:
+            self.reasons.append(
+                f"diffuse light: followed path by path; kept on the surfaces: {said}; {_percent(allowed)} was allowed"
+            )
+
     def _branches(self) -> None:
         """How many rays gather at the surface seen: as many as pay, by the variance inside a pixel with one and with four."""
-        keys = [key for key in ("lobe", "diffuse") if getattr(self.settings, key)]
-        if not keys:
+        if not getattr(self.settings, "by_chance", self.settings.lobe or self.settings.diffuse):
             return
 
         def variance(rays: int) -> float:
