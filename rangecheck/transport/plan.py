@@ -256,7 +256,7 @@ class _Planner:
 
     def _irradiance(self) -> None:
         """Diffuse interreflection looked up where it is kept on the surfaces, if interpolation is good enough; else followed path by path."""
-        if not self.settings.diffuse or self.tracer.materials.shiny.any() or not hasattr(self.tracer, "irradiance"):
+        if not self.settings.diffuse or self.tracer.materials.shiny.any():
             return
         kept = self.tracer.irradiance(self.settings.depth, self.settings.records)
         without = self._look(replace(self.settings, diffuse=False))
@@ -280,7 +280,7 @@ class _Planner:
 
     def _branches(self) -> None:
         """How many rays gather at the surface seen: as many as pay, by the variance inside a pixel with one and with four."""
-        if not getattr(self.settings, "by_chance", self.settings.lobe or self.settings.diffuse):
+        if not self.settings.by_chance:
             return
 
         def variance(rays: int) -> float:
