@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import resource
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from rangecheck.animation import Orbit
 from rangecheck.arrays import FloatArray
 from rangecheck.config import Settings
 from rangecheck.errors import PosesRefused
 from rangecheck.export.map_files import write_maps
 from rangecheck.export.meshes import write_mesh
-from rangecheck.export.pictures import png_bytes
+from rangecheck.export.pictures import png_bytes, read_png
 from rangecheck.export.stl import write_stl
 from rangecheck.export.video import find_encoder
 from rangecheck.files import write_bytes, write_json
+from rangecheck.pipeline.consistency import judge, write_consistency
 from rangecheck.pipeline.folder import check_free, job_folder, key_of
 from rangecheck.pipeline.health import versions
 from rangecheck.pipeline.inspect import scan_facts
@@ -27,9 +30,10 @@ from rangecheck.pipeline.preparing import prepared
 from rangecheck.pipeline.scanning import refused
 from rangecheck.pipeline.shape import findings_lines, solid_of
 from rangecheck.pipeline.subject import eye_of, hashes, read_all_scans, surface_of
-from rangecheck.pipeline.turning import render_turntable
+from rangecheck.pipeline.turning import Rendered, render_turntable
 from rangecheck.pipeline.views import map_at, orbit_of
 from rangecheck.progress import Reporter
+from rangecheck.reflectance import load_material
 from rangecheck.report import write_report
 from rangecheck.solid import Finding, Verdict, finding, verdict
 from rangecheck.surface import INVENTED, ORIGIN_NAMES, Surface
@@ -66,6 +70,8 @@ def run(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None,
             )
             for name in settings.light.materials
         ]
+        turntables += _stripes(shown, orbit, folder, settings, reporter, force=force)
+        consistency = _consistency(shown, ready.grids, orbit, turntables, folder, settings, reporter)
         with reporter.stage("contours"):
             for scan in read:
                 write_bytes(folder / "contours" / f"{scan.name}.png", png_bytes(contours_of(scan, settings)))
@@ -89,13 +95,14 @@ def run(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None,
         content = document(
             "run", fit=judged.fit, verdict=judged.to_dict(), stl=stl, method=method, reason=reason, area_shares=shares,
             scans=[scan_facts(scan) for scan in ready.scans], quality=ready.quality, registration=ready.registration, filtered=ready.filtered,
-            faces=len(shown.faces), decisions=reporter.notes,
+            faces=len(shown.faces), decisions=reporter.notes, front_deg=front,
+            consistency=consistency,
             turntables=[{"material": t.material, "film": t.film.name, "frames": len(t.frames), "plan": t.plan} for t in turntables],
             inputs=inputs, settings=settings.model_dump(mode="json"), versions=versions(), seconds=reporter.seconds,
             peak_memory_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         )  # fmt: skip
         with reporter.stage("report"):
-            keep_for_report(folder, shown, surface, read, judged if made is not None else None, settings)
+            keep_for_report(folder, shown, surface, read, judged if made is not None else None, settings, front_deg=front)
             write_report(page_of(folder, content), folder / "report.html")
         content["seconds"] = dict(reporter.seconds)
         write_json(folder / FINISHED, content)
@@ -108,6 +115,21 @@ def run(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None,
         f"look at {Path(out) / 'report.html'}",
     ]
     return Outcome(content, lines, judged.fit)
+
+
+def _consistency(
+    shown: Surface, scans: Sequence[RangeScan], orbit: Orbit, turntables: Sequence[Rendered], folder: Path, settings: Settings,
+    reporter: Reporter,
+) -> dict[str, Any]:  # fmt: skip
+    """What the turntables show of the surface, measured; drawn in the folder `consistency`."""
+    with reporter.stage("consistency"):
+        mirrored = next((t for t in turntables if t.mirrors), None)
+        frames = [] if mirrored is None else [path for path in mirrored.frames if path.suffix == ".png"]
+        judged, said, pictures = judge(shown, scans, orbit, settings, map(read_png, frames))
+        write_consistency(folder / "consistency", judged, pictures)
+    for line in said:
+        reporter.note(line.strip())
+    return judged
 
 
 def _with_scan_findings(judged: Verdict, shown: Surface, settings: Settings) -> Verdict:
@@ -138,6 +160,19 @@ def _front_deg(shown: Surface, eye_mm: FloatArray | None, reporter: Reporter) ->
     front = float(np.round(np.degrees(np.arctan2(away[0], away[2]))))
     reporter.note(f"the scanner's side, azimuth {front:g} degrees, counts as the front")
     return front
+
+
+def _stripes(
+    shown: Surface, orbit: Orbit, folder: Path, settings: Settings, reporter: Reporter, *, force: bool
+) -> list[Rendered]:
+    """Where a material of the pictures mirrors, also what it makes of bands of light: they bend where its slope does."""
+    mirror = next((name for name in settings.light.materials if load_material(name).strengths()[1:].any()), None)
+    if mirror is None or settings.turntable.show != "picture":
+        return []
+    striped = settings.model_copy(update={"turntable": settings.turntable.model_copy(update={"show": "stripes"})})
+    frames = folder / "frames" / "stripes"
+    made = render_turntable(shown, mirror, orbit, folder / "stripes.mp4", frames, striped, reporter, force=force)
+    return [replace(made, material="stripes")]
 
 
 def _distance_maps(shown: Surface, folder: Path, settings: Settings, front_deg: float, reporter: Reporter) -> None:

@@ -43,7 +43,7 @@ from rangecheck.scan import RangeScan
 from rangecheck.solid import Verdict
 from rangecheck.surface import Surface
 
-#: focal points of the ring, and the longer side of their maps in pixels
+#: focal points of the ring, counted from the front, and the longer side of their maps in pixels
 RING_DEG = tuple(float(a) for a in range(0, 360, 30))
 RING_PX = 240
 #: walls thicker than this share of the extent have one colour
@@ -69,6 +69,8 @@ def keep_for_report(
     scans: Sequence[RangeScan],
     found: Verdict | None,
     settings: Settings,
+    *,
+    front_deg: float,
 ) -> None:
     """Write what only the running job knows: the scans' brightness, the bust's likeness, distances from a ring of focal points.
 
@@ -99,7 +101,12 @@ def keep_for_report(
     camera = PinholeCamera.from_field_of_view(size["width"], size["height"], settings.picture.field_of_view_deg)
     caster = EmbreeCaster(shown.vertices, shown.faces)
     orbit = orbit_around(
-        shown, camera, frames=len(RING_DEG), elevation_deg=settings.maps.elevation_deg, margin=settings.turntable.margin
+        shown,
+        camera,
+        frames=len(RING_DEG),
+        elevation_deg=settings.maps.elevation_deg,
+        margin=settings.turntable.margin,
+        start_deg=front_deg,
     )
     ring = [trace_maps(shown, camera, orbit.world_from_camera(k), caster) for k in range(len(RING_DEG))]
     _write_arrays(
@@ -157,8 +164,11 @@ def page_of(folder: Path, content: dict[str, Any], studies: Sequence[str | Path]
         remarks=[(found["severity"], found["text"]) for found in (quality or {}).get("findings", ())],
         coverage=None if kept is None else _coverage(kept["coverage"], quality),
         model=None if kept is None else _model(kept),
+        front_deg=content.get("front_deg", 0.0),
         turntables=[
-            Turntable(t["material"], sorted((folder / "frames" / t["material"]).glob("*.png"))) for t in content["turntables"]
+            Turntable(t["material"], frames, content["settings"]["turntable"].get("start_deg", 0.0))
+            for t in content["turntables"]
+            if (frames := sorted((folder / "frames" / t["material"]).glob("*.png")))
         ],
         distance_maps=_distance_maps(folder),
         findings=[
@@ -195,7 +205,8 @@ def _reasons(content: dict[str, Any]) -> list[str]:
     found = content["verdict"]["findings"]
     shares, quality = content["area_shares"], content.get("quality")
     reasons = [f["message"] for f in found if f["severity"] == "error"]
-    reasons.append(content["verdict"]["sentence"])
+    sentence = content["verdict"]["sentence"]
+    reasons += [sentence] if not any(reason in sentence for reason in reasons) else []
     reasons.append("of the surface, " + ", ".join(f"{share:.1%} is {name}" for name, share in shares.items()))
     if quality:
         reasons.append(

@@ -43,10 +43,11 @@ class Figure:
 
 @dataclass(frozen=True)
 class Turntable:
-    """Frames of one material over the same orbit; frame i of n stands at azimuth 360 i / n degrees."""
+    """Frames of one material over the same orbit; frame i of n stands at azimuth start_deg + 360 i / n degrees from the front."""
 
     name: str
     frames: Sequence[Path]
+    start_deg: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,9 @@ class DistanceMap:
 @dataclass(frozen=True)
 class ReportContent:
     """Everything the report shows. `worth` are facts about all scans together, `remarks`
-    (severity, sentence) what is to be said of them; `provenance` are groups of facts by heading."""
+    (severity, sentence) what is to be said of them; `provenance` are groups of facts by heading.
+
+    Azimuths of turntables and focal points count from the front, which lies `front_deg` from +z towards +x."""
 
     title: str
     fit: bool
@@ -145,6 +148,7 @@ class ReportContent:
     model: Model | None = None
     turntables: Sequence[Turntable] = ()
     distance_maps: Sequence[DistanceMap] = ()
+    front_deg: float = 0.0
     findings: Sequence[Finding] = ()
     charts: Sequence[Figure] = ()
     decisions: Sequence[str] = ()

@@ -22,6 +22,7 @@ from rangecheck.report.content import DistanceMap, Model, ReportContent, Turntab
 from rangecheck.report.pack import octahedral, packed, packed_floats
 from rangecheck.report.sphere import halves, seen_share
 from rangecheck.surface import ORIGIN_NAMES
+from rangecheck.surface.topology import is_closed
 
 #: bytes that all frames together may take in the page
 FRAME_BUDGET = 4_500_000
@@ -47,7 +48,7 @@ def report_html(content: ReportContent) -> str:
     style = (room / "page.css").read_text("utf-8")
     script = "\n".join((room / name).read_text("utf-8") for name in _SCRIPTS)
     tables, frames_note = _turntables(content.turntables)
-    data: dict[str, Any] = {"tables": tables, "colours": _colours(content)}
+    data: dict[str, Any] = {"tables": tables, "colours": _colours(content), "front": content.front_deg}
     data["maps"] = [_map_form(one) for one in content.distance_maps]
     data["findings"] = [
         {"code": f.code, "severity": f.severity, "places": np.round(f.places_mm, 3).tolist()} for f in content.findings
@@ -99,7 +100,12 @@ def _turntables(tables: Sequence[Turntable]) -> tuple[list[dict[str, Any]], str]
                 total, count = sum(len(table.frames) for table in tables), sum(len(frames) for frames in shown)
                 note = f"{count} of {total} frames are in this file, as JPEG of quality {quality}"
                 forms = [
-                    {"name": table.name, "step": 360 * every / len(table.frames), "frames": [data_uri(f) for f in frames]}
+                    {
+                        "name": table.name,
+                        "start": table.start_deg,
+                        "step": 360 * every / len(table.frames),
+                        "frames": [data_uri(f) for f in frames],
+                    }
                     for table, frames in zip(tables, shown)
                 ]
                 return forms, note
@@ -121,6 +127,8 @@ def _light(picture: bytes) -> str:
     import cv2
 
     image = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        return data_uri(picture)
     shrink = _PICTURE_PX / max(image.shape[:2])
     if shrink < 1:
         image = cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
@@ -161,6 +169,7 @@ def _model_form(model: Model) -> dict[str, Any]:
     step = float((high - low).max()) / 65535 or 1.0
     return {
         "about": model.about,
+        "closed": is_closed(surface),
         "low": low.tolist(),
         "high": high.tolist(),
         "step": step,

@@ -63,4 +63,6 @@ function drawScale(where, name, low, high, unit, about) {
 
 /** A number with three digits that matter. */
 const short = (x) => (x === 0 ? "0" : Math.abs(x) >= 100 ? x.toFixed(0) : String(Number(x.toPrecision(3)))).replace("-", "−");
-const point = (p) => `(${Array.from(p, (x) => x.toFixed(1).replace("-", "−")).join(", ")}) mm`;
+/** With one decimal, and no minus before nought. */
+const tenth = (x) => (Math.round(x * 10) / 10 || 0).toFixed(1).replace("-", "−");
+const point = (p) => `(${Array.from(p, tenth).join(", ")}) mm`;

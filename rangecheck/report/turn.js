@@ -8,7 +8,7 @@
     slider.value = String(turned);
     degrees.textContent = `${turned}°`;
     pictures.forEach((picture, i) => {
-      const { frames, step } = data.tables[i], frame = frames[Math.round(turned / step) % frames.length];
+      const { frames, start, step } = data.tables[i], frame = frames[Math.round((((turned - start) % 360) + 360) % 360 / step) % frames.length];
       if (picture.src !== frame) picture.src = frame;
     });
   };

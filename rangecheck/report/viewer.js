@@ -30,7 +30,7 @@ async function readModel() {
 async function startViewer() {
   const canvas = byId("view"), status = byId("view-status"), legend = byId("view-legend"), reading = byId("view-reading");
   const [THREE, model] = await Promise.all([library(), readModel()]);
-  const renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true, preserveDrawingBuffer: true });
+  const renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true, stencil: true, preserveDrawingBuffer: true });
   renderer.localClippingEnabled = true;
   const { low, high } = data.model, middle = low.map((x, k) => (x + high[k]) / 2), radius = Math.hypot(...low.map((x, k) => high[k] - x)) / 2;
 
@@ -41,12 +41,21 @@ async function startViewer() {
   shape.setIndex(new THREE.BufferAttribute(model.faces, 1));
   const cut = new THREE.Plane(new THREE.Vector3(0, 0, -1), 0);
   const skin = new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 0.85 });
-  // what is seen through the cut of a closed surface is its far side: in one flat colour it is the section
   const inside = new THREE.MeshBasicMaterial({ side: THREE.BackSide });
+  // the section of a closed surface: the plane wherever a ray through the pixel leaves the surface more often than it enters it
+  const tally = (side, change) => new THREE.MeshBasicMaterial({ side, depthTest: false, depthWrite: false, colorWrite: false, stencilWrite: true, stencilFail: change, stencilZFail: change, stencilZPass: change, clippingPlanes: [] });
+  const counted = [tally(THREE.BackSide, THREE.IncrementWrapStencilOp), tally(THREE.FrontSide, THREE.DecrementWrapStencilOp)];
+  const face = new THREE.MeshBasicMaterial({ side: THREE.DoubleSide, stencilWrite: true, stencilFunc: THREE.NotEqualStencilFunc, stencilFail: THREE.ReplaceStencilOp, stencilZFail: THREE.ReplaceStencilOp, stencilZPass: THREE.ReplaceStencilOp });
+  const cap = new THREE.Mesh(new THREE.PlaneGeometry(4 * radius, 4 * radius), face);
+  const capped = new THREE.Group();
+  capped.add(...counted.map((material) => new THREE.Mesh(shape, material)), cap);
+  capped.children.forEach((part, k) => { part.renderOrder = 1 + k; });
+  capped.visible = false;
   const bust = new THREE.Mesh(shape, skin);
   const marks = new THREE.Group();
+  marks.renderOrder = 9;
   const scene = new THREE.Scene(), camera = new THREE.PerspectiveCamera(25, 1, radius / 100, radius * 20), lamp = new THREE.DirectionalLight(0xffffff, 2.3);
-  scene.add(bust, new THREE.Mesh(shape, inside), marks, new THREE.HemisphereLight(0xffffff, 0x9a948a, 1.35), camera);
+  scene.add(bust, new THREE.Mesh(shape, inside), capped, marks, new THREE.HemisphereLight(0xffffff, 0x9a948a, 1.35), camera);
   lamp.position.set(-0.5, 0.7, 1); camera.add(lamp, lamp.target); lamp.target.position.set(0, 0, -1);
 
   let wanted = 0, quiet = 0;
@@ -59,15 +68,15 @@ async function startViewer() {
   const redraw = () => { wanted ||= requestAnimationFrame(draw); };
   const orbit = new Orbit(canvas, () => {
     redraw();
-    tell("azimuth", orbit.azimuth, follow);
+    tell("azimuth", orbit.azimuth - data.front, follow);
     canvas.dataset.pose = JSON.stringify({ azimuth: orbit.azimuth, elevation: orbit.elevation, distance: orbit.distance, target: orbit.target });
     clearTimeout(quiet);
-    quiet = setTimeout(() => { status.textContent = `Seen from azimuth ${Math.round(orbit.azimuth) % 360}°, elevation ${Math.round(orbit.elevation)}°, ${Math.round(orbit.distance)} mm before ${point(orbit.target)}.`; }, 300);
+    quiet = setTimeout(() => { status.textContent = `Seen from azimuth ${Math.round(orbit.azimuth - data.front + 720) % 360}°, elevation ${Math.round(orbit.elevation)}°, ${Math.round(orbit.distance)} mm before ${point(orbit.target)}.`; }, 300);
   });
-  const follow = (azimuth) => { orbit.azimuth = azimuth; redraw(); };
+  const follow = (azimuth) => { orbit.azimuth = (((azimuth + data.front) % 360) + 360) % 360; redraw(); };
   when("azimuth", follow);
-  orbit.home = { azimuth: 0, elevation: 8, distance: (1.04 * radius) / Math.sin((25 * Math.PI) / 360), target: middle, spread: SPREAD };
-  Object.assign(orbit, { distance: orbit.home.distance, target: [...middle] });
+  orbit.home = { azimuth: ((data.front % 360) + 360) % 360, elevation: 8, distance: (1.04 * radius) / Math.sin((25 * Math.PI) / 360), target: middle, spread: SPREAD };
+  Object.assign(orbit, { azimuth: orbit.home.azimuth, distance: orbit.home.distance, target: [...middle] });
   byId("view-home").addEventListener("click", () => orbit.fly(orbit.home));
 
   const linear = (v) => { const c = v / 255; return c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4; };
@@ -148,13 +157,17 @@ async function startViewer() {
     const axis = document.querySelector('input[name="section"]:checked').value, whole = axis === "";
     slider.disabled = flip.disabled = whole;
     skin.clippingPlanes = inside.clippingPlanes = whole ? null : [cut];
+    for (const material of counted) material.clippingPlanes = [cut];
     skin.needsUpdate = inside.needsUpdate = true;
+    capped.visible = !whole && data.model.closed;
     if (whole) cutAt.textContent = "–";
     else {
       const k = Number(axis), at = low[k] + (slider.value / 1000) * (high[k] - low[k]), way = flip.checked ? 1 : -1;
       cut.normal.set(0, 0, 0).setComponent(k, way);
       cut.constant = -way * at;
-      cutAt.textContent = `${at.toFixed(1).replace("-", "−")} mm`;
+      cutAt.textContent = `${tenth(at)} mm`;
+      cap.position.set(...middle).setComponent(k, at);
+      cap.rotation.set(k === 1 ? -Math.PI / 2 : 0, k === 0 ? Math.PI / 2 : 0, 0);
     }
     redraw();
   };
@@ -182,7 +195,7 @@ async function startViewer() {
   canvas.addEventListener("pointermove", (e) => { if (!asked) requestAnimationFrame(read); asked = e; });
   canvas.addEventListener("pointerleave", () => { asked = null; reading.textContent = ""; });
 
-  const look = () => { inside.color.set(getComputedStyle(document.documentElement).getPropertyValue("--cut").trim()); redraw(); };
+  const look = () => { for (const material of [inside, face]) material.color.set(getComputedStyle(document.documentElement).getPropertyValue("--cut").trim()); redraw(); };
   dark.addEventListener("change", look);
   new ResizeObserver(() => {
     renderer.setPixelRatio(Math.min(2, devicePixelRatio));
