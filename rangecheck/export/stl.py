@@ -64,16 +64,26 @@ def write_stl(
         proved_file(path, force=force, must_be_solid=not force_open, severities=severities) as (part, judged),
         part.open("wb") as stream,
     ):
-        if not ascii:
-            stream.write(_HEADER.ljust(80, b" ") + np.uint32(len(rounded.faces)).astype("<u4").tobytes())
-        else:
-            stream.write(b"solid rangecheck millimetres\n")
-        for start in range(0, len(rounded.faces), 1 << 18):
-            records = _records(rounded, slice(start, start + (1 << 18)))
-            stream.write(_facets(records) if ascii else records.tobytes())
-        if ascii:
-            stream.write(b"endsolid rangecheck\n")
+        for piece in _pieces(rounded, ascii):
+            stream.write(piece)
     return Exported(Path(path), len(rounded.faces), judged.verdict, moved, judged.surface)
+
+
+def stl_bytes(surface: Surface, *, ascii: bool = False) -> bytes:
+    """A surface as the bytes of an STL file, neither checked nor mended: for tests and measurements. `write_stl` is for parts."""
+    return b"".join(_pieces(surface, ascii))
+
+
+def _pieces(surface: Surface, ascii: bool) -> Iterator[bytes]:
+    if ascii:
+        yield b"solid rangecheck millimetres\n"
+    else:
+        yield _HEADER.ljust(80, b" ") + np.uint32(len(surface.faces)).astype("<u4").tobytes()
+    for start in range(0, len(surface.faces), 1 << 18):
+        records = _records(surface, slice(start, start + (1 << 18)))
+        yield _facets(records) if ascii else records.tobytes()
+    if ascii:
+        yield b"endsolid rangecheck\n"
 
 
 @dataclass

@@ -16,7 +16,7 @@ from rangecheck.pipeline.health import versions
 from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.subject import eye_of, hashes, read_subject
 from rangecheck.progress import Reporter
-from rangecheck.solid import Solid, Verdict, check_solid, choose_base_height, verdict
+from rangecheck.solid import Solid, Verdict, check_solid, choose_base_height, untangle, verdict
 from rangecheck.solid.base import UP, trimmed
 from rangecheck.solid.closing import Closed, close_surface
 from rangecheck.solid.hollow import Hollow, hollow
@@ -65,12 +65,29 @@ def make_solid(surface: Surface, settings: Settings, reporter: Reporter, eye_mm:
             with reporter.stage("hollowing"):
                 shaped = _hollowed(shaped, made, wanted, reporter)
         with reporter.stage("proving"):
-            made.solid = Solid.from_surface(shaped, severities=settings.checking.severities)
-        made.surface, made.verdict = shaped, made.solid.verdict
+            made.solid = _proved(shaped, settings, reporter)
+        made.surface, made.verdict = made.solid.surface, made.solid.verdict
     except NotSolid as refusal:
         found = refusal.measured.get("verdict")
         made.solid, made.verdict = None, found if isinstance(found, Verdict) else check_solid(made.surface)
     return made
+
+
+def _proved(surface: Surface, settings: Settings, reporter: Reporter) -> Solid:
+    """The surface as a solid; where cutting and thinning left faces that cross by a hair, with these loosened within the leash."""
+    severities = settings.checking.severities
+    try:
+        return Solid.from_surface(surface, severities=severities)
+    except NotSolid as refusal:
+        if not any(f.code in ("self-intersections", "overlapping-faces") for f in refusal.measured["findings"]):
+            raise
+        loose = untangle(surface, max_move_mm=settings.solid.max_move_mm)
+        if loose.after:
+            raise
+        reporter.note(
+            f"{loose.before} pairs of faces came loose, {loose.vertices_moved} vertices moved by up to {loose.moved_mm:.3g} mm"
+        )
+        return Solid.from_surface(loose.surface, severities=severities)
 
 
 def _can_go_on(judged: Verdict) -> bool:

@@ -11,11 +11,11 @@ import numpy.typing as npt
 
 from rangecheck.arrays import mm_per
 from rangecheck.solid.findings import Finding, Verdict, finding, verdict
-from rangecheck.solid.opinions import Opinion, disagreements, second_opinions
+from rangecheck.solid.opinions import Opinion, ask_meshlab, disagreements, opinions_with
 from rangecheck.solid.printer import Printer
 from rangecheck.solid.printing import UP, check_printing
 from rangecheck.solid.shape import shape_findings
-from rangecheck.solid.solid import Solid, check_solid
+from rangecheck.solid.solid import Solid, check_solid, engine_refuses
 from rangecheck.surface.mesh_files import MeshFile, open_mesh
 
 
@@ -40,7 +40,9 @@ def check_mesh_file(
     """Everything that can be found out about a mesh file. `opinions` asks trimesh, MeshLab and manifold3d too; with `printer`, a solid is
     also judged for printing as it stands along `up`. Raises InputError for what cannot be read, UnitMissing where the unit is not said."""
     read = open_mesh(path, unit)
-    judged = check_solid(read.surface, severities=severities)
+    # MeshLab thinks in a process of its own while the surface is judged here
+    asked = ask_meshlab(path) if opinions else None
+    judged = check_solid(read.surface, severities=severities, engine=asked is None)
     found: list[Finding] = list(judged.findings)
     facts: dict[str, Any] = dict(judged.facts)
     extra = [note for note in read.notes if "bytes follow" in note]
@@ -48,10 +50,13 @@ def check_mesh_file(
         found.append(finding("trailing-bytes", 1, extra[0], severities=severities))
     found += shape_findings(read.surface, severities=severities)
     answers: list[Opinion] = []
-    if opinions:
-        answers = second_opinions(path, read.surface)
+    if asked is not None:
+        answers = opinions_with(asked, path, read.surface)
         found += disagreements(read.surface, answers, mm_per(read.unit), severities)
         facts["opinions"] = [a.to_dict() for a in answers]
+        if facts["closed"] and not answers[-1].closed:
+            found.append(engine_refuses(answers[-1].facts["status"], severities))
+        facts["engine_asked"] = True
     if printer is not None and judged.fit:
         printed = check_printing(Solid.from_surface(read.surface), printer, up=up, severities=severities)
         found += printed.findings

@@ -22,16 +22,21 @@ from rangecheck.solid.engine import from_engine, simplified, to_engine
 from rangecheck.solid.offset import inner_offset
 from rangecheck.solid.slices import frame_of
 from rangecheck.solid.solid import Solid
-from rangecheck.solid.thickness import sample_surface
+from rangecheck.solid.thickness import Samples, sample_surface
+from rangecheck.solid.untangle import untangle
 from rangecheck.surface import topology as topo
 from rangecheck.surface.distance import SurfaceDistance
 from rangecheck.surface.surface import INVENTED, Surface
 
 SIDES = 48
+#: grid of the cavity's surface, in walls: ridges of the cavity are cut off within a cell, which makes the wall thicker there
+STEP = 0.3
 #: how far a plug stays clear of its drain, all round
 CLEARANCE_MM = 0.1
 #: drilling stops after this many drains; so many places without room for a cavity are listed
 MOST_DRAINS, MOST_PLACES = 12, 24
+#: of the outside, from which the wall is measured
+MOST_SAMPLES = 200_000
 
 
 @dataclass(frozen=True)
@@ -136,21 +141,20 @@ def hollow(
 ) -> Hollow:
     """A solid, or a closed surface, with a cavity `wall_mm` below its surface and drains of `drain_mm` diameter (0: none) for standing along `up`.
 
-    step_mm           grid of the cavity's surface; None means 0.4 walls
+    step_mm           grid of the cavity's surface; None means STEP walls
     least_pocket_mm3  pockets below this do not count as resin kept
     Raises SurfaceError when nothing lies deeper than the wall."""
     if not (wall_mm > 0 and drain_mm >= 0):
         raise SettingError(f"wall_mm is {wall_mm} and drain_mm {drain_mm}; lengths are needed", key="wall_mm")
     outside, notes = (solid.surface, solid.notes) if isinstance(solid, Solid) else (solid, ())
-    inner = inner_offset(outside, wall_mm, step_mm or 0.4 * wall_mm)
+    inner = inner_offset(outside, wall_mm, step_mm or STEP * wall_mm)
     inner = _without_specks(inner, (drain_mm or wall_mm) ** 3) if inner is not None else None
     if inner is None:
         raise SurfaceError(
             f"nothing lies {wall_mm:g} mm deep in the part, so a wall of {wall_mm:g} mm leaves no cavity; ask for a thinner wall",
             wall_mm=wall_mm,
         )
-    # the grid's many faces say no more than a few: collapsed within a small part of the tolerance
-    inner = simplified(inner, tolerance_mm / 10)
+    inner = _fewer_faces(inner, tolerance_mm / 5)
     outer, outer_name = to_engine(outside)
     cavity, cavity_name = to_engine(inner)
     sources = [(outer_name, outside), (cavity_name, inner)]
@@ -160,11 +164,12 @@ def hollow(
     made, surface = wall, from_engine(wall, sources, "drain")
     kept = _kept(surface, outside, up, wall_mm, least_pocket_mm3)
     while kept and drain_mm > 0 and len(drains) < MOST_DRAINS:
-        drain = _drain_for(kept[0], outside, up, wall_mm, drain_mm)
-        rod = _rod(drain, drain.diameter_mm / 2, wall_mm)
-        made = made - rod
-        plugs += _plug(wall, rod, drain, wall_mm)
-        drains.append(drain)
+        new = [_drain_for(pocket, outside, up, wall_mm, drain_mm) for pocket in kept[: MOST_DRAINS - len(drains)]]
+        for drain in new:
+            rod = _rod(drain, drain.diameter_mm / 2, wall_mm)
+            made = made - rod
+            plugs += _plug(wall, rod, drain, wall_mm)
+        drains += new
         surface = from_engine(made, sources, "drain")
         before = kept
         kept = _kept(surface, outside, up, wall_mm, least_pocket_mm3)
@@ -179,6 +184,15 @@ def hollow(
     )
     measured = measured_wall(outside, inner, wall_mm, tolerance_mm)
     return Hollow(surface, tuple(plugs), measured, tuple(drains), tuple(kept), volume, (x, y, z), (*notes, *done))
+
+
+def _fewer_faces(inner: Surface, tolerance_mm: float) -> Surface:
+    """The grid's many faces say no more than a few: collapsed within the tolerance, and no farther than they stay out of each other's way."""
+    for share in (1.0, 0.25):
+        loose = untangle(simplified(inner, share * tolerance_mm), max_move_mm=tolerance_mm)
+        if not loose.after:
+            return loose.surface
+    return inner
 
 
 def _without_specks(inner: Surface, least_mm3: float) -> Surface | None:
@@ -201,7 +215,7 @@ def measured_wall(outer: Surface, inner: Surface, asked_mm: float, tolerance_mm:
     cumulated = np.cumsum(samples.area_mm2[order])
     median = float(distance[order][np.searchsorted(cumulated, cumulated[-1] / 2)])
     within = float(samples.area_mm2[np.abs(distance - asked_mm) <= tolerance_mm].sum() / cumulated[-1])
-    outside = sample_surface(outer, max(asked_mm, outer.extent_mm / 200))
+    outside = _evenly(sample_surface(outer, max(asked_mm, outer.extent_mm / 200)), MOST_SAMPLES)
     far, _ = SurfaceDistance(inner).distance_mm(outside.places_mm)
     thick = far > asked_mm + tolerance_mm
     full: list[tuple[float, float, float, float]] = []
@@ -213,6 +227,12 @@ def measured_wall(outer: Surface, inner: Surface, asked_mm: float, tolerance_mm:
         waiting = waiting[apart > 8 * asked_mm]
     share = float(outside.area_mm2[np.abs(far - asked_mm) <= tolerance_mm].sum() / outside.area_mm2.sum())
     return Wall(asked_mm, float(distance.min()), median, float(distance.max()), tolerance_mm, within, share, tuple(full))
+
+
+def _evenly(samples: Samples, most: int) -> Samples:
+    """Every n-th sample, so that no more than `most` are left."""
+    every = -(-len(samples.face) // most)
+    return Samples(samples.places_mm[::every], samples.face[::every], samples.area_mm2[::every])
 
 
 def _kept(surface: Surface, outside: Surface, up: npt.ArrayLike, wall_mm: float, least_mm3: float) -> list[Pocket]:

@@ -3,7 +3,7 @@
 A grid is looked at in blocks of 16 cells a side, then of 8, 4 and 2. Distance changes by at most 1 mm per mm, so a block whose middle is
 farther from the depth than half its diagonal holds no part of the zero set and is not looked at again. In those of 2 that are left every
 cell is cut into six tetrahedra along its diagonal (Kuhn 1960), which fit together across cells, so that the zero set is closed and manifold by construction. Vertices are
-interpolated along edges: exact for planes, off by step^2 / (8 radius) on curved walls; ridges, where the nearest side changes, are rounded
+interpolated along edges: exact for planes, off by step^2 / (8 radius) on curved walls; ridges, where the nearest side changes, are cut off
 within a cell.
 """
 
@@ -51,7 +51,7 @@ def inner_offset(surface: Surface, depth_mm: float, step_mm: float, *, most_bloc
     corner = np.stack(np.meshgrid(*(np.arange(BLOCK + 1),) * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     index = (block[:, None] * BLOCK + corner).reshape(-1, 3)
     number = np.ravel_multi_index(tuple(index.T), tuple(nodes))
-    unique, place = np.unique(number, return_inverse=True)
+    unique, place = _numbered(number, int(nodes.prod()))
     at = np.stack(np.unravel_index(unique, tuple(nodes)), axis=1)
     values = distance.signed_distance_mm(origin + at * step_mm)[0] + depth_mm
     # a node exactly at the depth counts as outside: then every cut lies strictly between two nodes
@@ -67,6 +67,17 @@ def inner_offset(surface: Surface, depth_mm: float, step_mm: float, *, most_bloc
     vertices = origin + step_mm * ((1 - weight) * at[a] + weight * at[b])
     faces = corners.reshape(-1, 3)
     return Surface(vertices, faces, origin_of_face=np.full(len(faces), INVENTED, np.uint8), part_names=("cavity",))
+
+
+def _numbered(number: IntArray, most: int) -> tuple[IntArray, IntArray]:
+    """Distinct numbers below `most`, ascending, and the place of each given one among them."""
+    if most > 1 << 28:
+        return np.unique(number, return_inverse=True)
+    place = np.zeros(most, np.int32)
+    place[number] = 1
+    unique = np.flatnonzero(place)
+    place[unique] = np.arange(len(unique), dtype=np.int32)
+    return unique, place[number]
 
 
 def _march(values: FloatArray, nodes_of_block: IntArray) -> tuple[IntArray, IntArray]:

@@ -29,6 +29,7 @@ from rangecheck.surface.weld import weld_exactly
 #: decimals to which trimesh merges vertices, in the file's unit
 TRIMESH_DECIMALS = 8
 TIMEOUT_S = 120
+Asked = subprocess.Popen[str]
 
 _MESHLAB = """
 import json, sys
@@ -62,13 +63,18 @@ class Opinion:
 
 def second_opinions(path: str | Path, surface: Surface, *, intersections: bool = True) -> list[Opinion]:
     """Our opinion of `surface`, which was read from `path`, then those of trimesh, MeshLab and manifold3d."""
-    meshlab = _start_meshlab(Path(path), intersections)
+    return opinions_with(ask_meshlab(path, intersections=intersections), path, surface)
+
+
+def opinions_with(meshlab: Asked, path: str | Path, surface: Surface) -> list[Opinion]:
+    """As `second_opinions`, where MeshLab was asked before and had time to think."""
     ours = Opinion("rangecheck", topo.is_closed(surface), {"vertices": len(surface.vertices), "faces": len(surface.faces)})
-    opinions = [ours, _trimesh(Path(path)), _manifold(surface)]
-    return [*opinions[:2], _meshlab_answer(meshlab), opinions[2]]
+    opinions = [ours, trimesh_opinion(path), manifold_opinion(surface)]
+    return [*opinions[:2], meshlab_answer(meshlab), opinions[2]]
 
 
-def _trimesh(path: Path) -> Opinion:
+def trimesh_opinion(path: str | Path) -> Opinion:
+    """What trimesh makes of the file."""
     try:
         import trimesh
     except ImportError:
@@ -88,13 +94,15 @@ def _trimesh(path: Path) -> Opinion:
         return Opinion("trimesh", None, error=f"{type(error).__name__}: {error}"[:200])
 
 
-def _start_meshlab(path: Path, intersections: bool) -> subprocess.Popen[str]:
-    command = [sys.executable, "-c", _MESHLAB, str(path.resolve()), "1" if intersections else "0"]
+def ask_meshlab(path: str | Path, *, intersections: bool = True) -> Asked:
+    """MeshLab's process, begun on the file."""
+    command = [sys.executable, "-c", _MESHLAB, str(Path(path).resolve()), "1" if intersections else "0"]
     quiet = {**os.environ, "QT_QPA_PLATFORM": "offscreen"}
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=quiet)
 
 
-def _meshlab_answer(process: subprocess.Popen[str]) -> Opinion:
+def meshlab_answer(process: Asked) -> Opinion:
+    """What MeshLab says, when it is done."""
     try:
         out, errors = process.communicate(timeout=TIMEOUT_S)
     except subprocess.TimeoutExpired:
@@ -109,7 +117,8 @@ def _meshlab_answer(process: subprocess.Popen[str]) -> Opinion:
     return Opinion("MeshLab", closed, facts)
 
 
-def _manifold(surface: Surface) -> Opinion:
+def manifold_opinion(surface: Surface) -> Opinion:
+    """What manifold3d makes of the welded surface."""
     try:
         solid, _ = to_engine(surface)
     except NotSolid as refusal:

@@ -12,6 +12,7 @@ import numpy as np
 
 from rangecheck.errors import SurfaceError
 from rangecheck.solid.engine import from_engine, simplified, to_engine
+from rangecheck.solid.hollow import STEP
 from rangecheck.solid.offset import inner_offset
 from rangecheck.surface.surface import Surface
 
@@ -29,7 +30,7 @@ def hollow_back(relief: Surface, *, wall_mm: float, step_mm: float | None = None
     mark = np.zeros(len(relief.vertices), bool)
     mark[relief.faces[back]] = True
     longer = replace(relief, vertices=relief.vertices + 2 * wall_mm * np.outer(mark, away))
-    inner = inner_offset(longer, wall_mm, step_mm or 0.4 * wall_mm)
+    inner = inner_offset(longer, wall_mm, step_mm or STEP * wall_mm)
     if inner is None:
         raise SurfaceError(
             f"nothing lies {wall_mm:g} mm deep in the relief, so its back cannot be hollowed; ask for a thinner wall",

@@ -117,6 +117,10 @@ def _engine_word(surface: Surface, severities: Mapping[str, str] | None) -> list
     try:
         to_engine(surface)
     except NotSolid as refusal:
-        word = refusal.measured["word"]
-        return [finding("engine-refuses", 1, f"manifold3d refuses the surface: {word}", severities=severities, word=word)]
+        return [engine_refuses(refusal.measured["word"], severities)]
     return []
+
+
+def engine_refuses(word: str, severities: Mapping[str, str] | None = None) -> Finding:
+    """The finding that manifold3d refused a surface, with its word."""
+    return finding("engine-refuses", 1, f"manifold3d refuses the surface: {word}", severities=severities, word=word)

@@ -79,14 +79,19 @@ def _held(origin: FloatArray, wanted: FloatArray, current: FloatArray, leash_mm:
 
 
 def _around(surface: Surface, vertices: FloatArray, culprits: IntArray, moved: IntArray) -> IntArray:
-    """Faces that could meet a face with moved vertices: all whose box touches the box around these."""
+    """Faces that could meet a face with moved vertices: the boxes of such two touch, so their middles are no farther apart than the
+    longer sides of both."""
+    from scipy.spatial import cKDTree
+
     mine = np.asarray(moved[surface.faces].any(axis=1))
     mine[culprits] = True
     corners = vertices[surface.faces]
     low, high = corners.min(axis=1), corners.max(axis=1)
-    # one box around each culprit's neighbourhood would do; the few faces inside the common box cost little more
     first, last = low[mine].min(axis=0), high[mine].max(axis=0)
-    return np.flatnonzero(((low <= last) & (high >= first)).all(axis=1))
+    near = np.flatnonzero(((low <= last) & (high >= first)).all(axis=1))
+    middle, size = 0.5 * (low + high), np.linalg.norm(high - low, axis=1)
+    away, _ = cKDTree(middle[mine]).query(middle[near])
+    return near[away <= 0.5 * (size[near] + size[mine].max())]
 
 
 def _give_back(surface: Surface, vertices: FloatArray, culprits: IntArray) -> FloatArray:
