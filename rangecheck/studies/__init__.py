@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 #: every study by name, and the module whose `study(quick, part)` makes it
 STUDIES = {
+    "checking": "rangecheck.studies.checking",
     "fit": "rangecheck.studies.fit",
     "consistency": "rangecheck.studies.consistency",
     "pictures": "rangecheck.studies.pictures",
