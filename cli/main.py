@@ -24,6 +24,7 @@ COMMANDS = {
     "turntable": "Frames and video of an orbit; resumes where it was stopped.",
     "dataset": "Many pictures with their truth over sampled parameters, for vision research.",
     "simulate": "Make the scans that a range finder would have measured of a mesh.",
+    "fit": "Recover material and lamps from photographs of a known shape.",
     "decode": "Turn structured-light pictures into a range scan.",
     "draw": "Line drawing of a modelled scene, hidden lines removed.",
     "sample": "Make the sample scans again, byte for byte.",

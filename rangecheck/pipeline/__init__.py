@@ -18,6 +18,7 @@ _WHERE = {
     "draw": "views",
     "explain": "inspect",
     "init": "beginning",
+    "fit": "fitting",
     "maps": "views",
     "materials": "inspect",
     "mesh": "scanning",

@@ -27,7 +27,7 @@ BEND, OUTLIER = 2.5, 6.0
 TWO_SIDED_95 = 1.959963984540054
 #: starts: widths of the lobes (rms slope of the rough limit) and roughness (2 pi sigma/lambda)^2
 _START_WIDTHS, _START_ROUGHNESS = (0.03, 0.08, 0.2, 0.5), (0.03, 0.6, 10.0)
-_POLISH, _SETTLED = 25, 0.03
+_POLISH, _SETTLED, _LITTLE = 25, 0.03, 0.01
 #: how much more (minus log likelihood) an end on a few pixels may cost to be tried on all, and one on all to count as good as the best
 _RIVAL, _AS_GOOD = 12.0, 2.0
 #: pixels on which rivals are told apart before all are used
@@ -87,7 +87,7 @@ def fit(
     problem: Problem,
     *,
     starts: Sequence[Problem] | None = None,
-    pixels: int = 3000,
+    pixels: int = 2500,
     finalists: int = 4,
     known_noise: bool = True,
 ) -> Fitted:
@@ -326,7 +326,8 @@ def polish(problem: Problem, *, known_noise: bool = True) -> Fitted:
             if damping > 1e6:
                 break
             continue
-        small = bool((np.abs(moved - theta)[free] < _SETTLED * spread[free]).all())
+        # along what the pictures do not fix there is no end to walk to: little gained is the end too
+        small = bool((np.abs(moved - theta)[free] < _SETTLED * spread[free]).all()) or cost - trial[3] < _LITTLE
         theta, damping = moved, 0.1 * damping if damping > 1e-6 else 0.0
         normal, score, meat, cost, facts = trial
         if small:

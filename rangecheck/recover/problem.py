@@ -147,7 +147,7 @@ class Problem:
                 found.append(Parameter(name, "strength", 0, STRENGTHS.index(name), 1.0, 0.0, 1e3))
             else:
                 now = getattr(self.material, name)
-                low, high = (3e-3, 30.0) if name == "sigma_um" else (0.5, 1e3)
+                low, high = (3e-3, 8.0) if name == "sigma_um" else (0.5, 1e3)
                 number = 3 + LENGTHS.index(name)
                 found.append(Parameter(name, "length", 0, number, 1.0, math.log(low * wave / now), math.log(high * wave / now)))
         for k in range(len(self.lights)):

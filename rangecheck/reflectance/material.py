@@ -232,13 +232,15 @@ def load_material(name_or_path: str | Path) -> Material:
 
 
 _NUMBERS = ("K_lm", "K_ss", "K_sl", "K_s")
-_KEYS = (*_NUMBERS, "sigma_um", "correlation_um", "wavelengths_um", "masking", "bounded", "description", "source", "index")
+_KEYS = (*_NUMBERS, "sigma_um", "correlation_um", "wavelengths_um", "masking", "bounded", "description", "source", "index", "uncertainty")
 _INDEX_KEYS = ("wavelengths_um", "n", "k", "source")
 
 
 def _material_from(path: Path, document: dict[str, Any]) -> Material:
     values = dict(document)
     index = values.pop("index", {})
+    # what a fit says of its own numbers is for people and programs, not for light
+    values.pop("uncertainty", None)
     unknown = [key for key in document if key not in _KEYS] + [f"index.{key}" for key in index if key not in _INDEX_KEYS]
     if unknown:
         raise InputError(path, f"unknown key {unknown[0]}; a material has {', '.join(_KEYS)}", unknown=unknown)

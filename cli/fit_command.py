@@ -1,0 +1,57 @@
+"""rangecheck fit"""
+
+import click
+
+from .common import Point, common, settings_from
+
+
+@click.command("fit", short_help="Recover material and lamps from photographs of a known shape.")
+@click.argument("pictures", nargs=-1, required=True, type=click.Path())
+@click.option(
+    "--sphere", type=Point(), metavar="COLUMN,ROW,RADIUS", help="They show a sphere of this outline, pixels, from far away."
+)
+@click.option("--on", "model", type=click.Path(), metavar="MESH", help="They show this mesh, scan or modelled scene.")
+@click.option("--camera", type=Point(), metavar="X,Y,Z", help="Where the camera stood, mm; it looks at the middle of the object.")
+@click.option("--field", type=click.FloatRange(1, 170), default=30.0, help="The camera's horizontal field of view, degrees.")
+@click.option("--lights", type=click.Path(), metavar="FILE", help="About where the lamps stand: x y z, one line a picture.")
+@click.option("--calibrate", type=click.Choice(["chrome", "matt"]), help="Only find the lamps, on a sphere of this kind.")
+@click.option(
+    "--response", type=click.Choice(["linear", "srgb"]), default="linear", help="How the pictures' numbers follow light."
+)
+@click.option("--noise", type=click.FloatRange(1e-6, 1), default=0.01, help="Standard deviation of a pixel, parts of full scale.")
+@click.option(
+    "--irradiance", type=click.FloatRange(1e-9), default=3.0, help="Of the lamps, so that a white surface shows irradiance/pi."
+)
+@click.option("--spike", is_flag=True, help="Also fit a mirror's share; its highlight must be seen.")
+@click.option(
+    "-o", "--output", "out", type=click.Path(), metavar="FILE", help="Material file (.toml); with --calibrate the list of lights."
+)
+@common("unit", "config", "set", "force")
+def command(
+    pictures,
+    sphere,
+    model,
+    camera,
+    field,
+    lights,
+    calibrate,
+    response,
+    noise,
+    irradiance,
+    spike,
+    out,
+    unit,
+    config,
+    assignments,
+    force,
+    reporter,
+):
+    """Recover material and lamps from photographs of a known shape, one lamp a picture, with 95 % intervals and a statement of what
+    the pictures cannot determine. The material file serves every --material."""
+    from rangecheck.pipeline import fit
+
+    return fit(
+        pictures, out, settings=settings_from(config, assignments), unit=unit, sphere=sphere, model=model, camera_mm=camera,
+        field_deg=field, lights=lights, calibrate=calibrate, response=response, noise=noise, spike=spike, irradiance=irradiance,
+        force=force, reporter=reporter,
+    )  # fmt: skip

@@ -1,0 +1,105 @@
+"""Lamps calibrated on photographed spheres, and the material file that a fit leaves."""
+
+import math
+import tomllib
+
+import numpy as np
+import pytest
+from rangecheck_cli.main import exit_status
+
+from rangecheck.errors import SceneError
+from rangecheck.recover.sight import sphere_sight
+from rangecheck.recover.spheres import (
+    Outline,
+    light_from_chrome,
+    lights_from_matt,
+    outline_of,
+    prediction_errors,
+    rough_matt,
+)
+from rangecheck.reflectance import load_material
+
+SPHERE = Outline((60.0, 58.0), 50.0)
+
+
+def degrees(a, b):
+    return np.degrees(np.arccos(np.clip((a * b).sum(-1), -1, 1)))
+
+
+def matt_picture(direction, gain=0.7, slope=0.0, noise=0.01, seed=0):
+    sight = sphere_sight(SPHERE.centre_px, SPHERE.radius_px, (120, 121), 0.5)
+    shown = gain * rough_matt(sight.normals, sight.views, direction, slope)
+    return sight.spread(shown, 0.0) + np.random.default_rng(seed).normal(0, noise, (120, 121))
+
+
+def test_a_lamp_is_found_on_a_matt_sphere_and_its_gain_with_it():
+    lamps = np.array([[0.3, 0.2, 0.9], [-0.4, 0.3, 0.8], [0.1, -0.5, 0.7]])
+    lamps /= np.linalg.norm(lamps, axis=1, keepdims=True)
+    found = lights_from_matt([matt_picture(d, slope=0.3, seed=k) for k, d in enumerate(lamps)], SPHERE)
+    assert degrees(found.directions, lamps).max() < 0.3
+    assert np.abs(found.gains / 0.7 - 1).max() < 0.01
+    assert found.slope == pytest.approx(0.3, abs=0.05)
+
+
+def test_a_highlight_s_place_on_a_mirror_ball_is_its_lamp_s_direction():
+    sight = sphere_sight(SPHERE.centre_px, SPHERE.radius_px, (120, 121), 0.5)
+    lamp = np.array([0.3, 0.5, 0.81])
+    lamp /= np.linalg.norm(lamp)
+    mirrored = 2 * sight.normals[:, 2:] * sight.normals - sight.views
+    picture = sight.spread((degrees(mirrored, lamp) < 6.0).astype(float), 0.0)
+    # a highlight 6 degrees in radius is 5 pixels wide: its middle is known to a tenth of a pixel, 0.2 degrees
+    assert degrees(light_from_chrome(picture, SPHERE), lamp) < 0.3
+
+
+def test_what_shows_no_lamp_or_no_disc_is_refused():
+    with pytest.raises(SceneError, match="dark"):
+        light_from_chrome(np.zeros((120, 121)), SPHERE)
+    with pytest.raises(SceneError, match="no disc"):
+        outline_of(np.ones((40, 90), bool))
+    with pytest.raises(SceneError, match="12 pixels"):
+        outline_of(np.eye(12))
+
+
+@pytest.mark.real_data
+def test_photographed_spheres_give_their_lamps_and_predict_each_other(real_data):
+    import cv2
+
+    folder = real_data / "spheres_photographed"
+
+    def read(kind, name):
+        return cv2.imread(str(folder / kind / f"{kind}.{name}.png"), cv2.IMREAD_GRAYSCALE) / 255.0
+
+    listed = np.loadtxt(folder / "lights.txt", skiprows=1)
+    listed /= np.linalg.norm(listed, axis=1, keepdims=True)
+    mirror = outline_of(read("chrome", "mask") > 0.5)
+    chrome = np.array([light_from_chrome(read("chrome", k), mirror) for k in range(12)])
+    assert np.median(degrees(chrome, listed)) < 2.5
+    outline = outline_of(read("gray", "mask") > 0.5)
+    pictures = [read("gray", k) for k in range(12)]
+    matt = lights_from_matt(pictures, outline)
+    # the list itself lies 2 degrees from the chrome sphere's lamps; the two spheres agree better with each other than with it
+    assert np.median(degrees(matt.directions, chrome)) < 2.0
+    assert np.median(degrees(matt.directions, listed)) < 3.0
+    assert math.sqrt(float((prediction_errors(pictures, outline, chrome) ** 2).mean())) < 0.04
+
+
+def test_the_command_writes_a_material_with_its_uncertainty_that_other_commands_take(tmp_path):
+    import cv2
+
+    lamp = np.array([0.4, 0.3, 0.8]) / np.linalg.norm([0.4, 0.3, 0.8])
+    picture = np.clip(matt_picture(lamp, 0.6) * 65535, 0, 65535).astype(np.uint16)
+    cv2.imwrite(str(tmp_path / "ball.png"), picture)
+    sphere = ["--sphere", "60,58,50"]
+    assert exit_status(["fit", str(tmp_path / "ball.png"), *sphere, "-o", str(tmp_path / "ball.toml"), "-q"]) == 0
+    material = load_material(tmp_path / "ball.toml")
+    # irradiance 3, so that a white surface shows 3/pi
+    assert material.K_lm == pytest.approx(0.6 * math.pi / 3, rel=0.01)
+    document = tomllib.loads((tmp_path / "ball.toml").read_text())
+    low, high = document["uncertainty"]["K_lm"]
+    assert low < material.K_lm < high
+    assert document["uncertainty"]["not_determined"]
+    assert (
+        exit_status(["fit", str(tmp_path / "ball.png"), *sphere, "--calibrate", "matt", "-o", str(tmp_path / "l.txt"), "-q"]) == 0
+    )
+    assert degrees(np.loadtxt(tmp_path / "l.txt", skiprows=1), lamp) < 0.5
+    assert exit_status(["fit", str(tmp_path / "ball.png"), "-o", str(tmp_path / "b.toml"), "-q"]) == 2
