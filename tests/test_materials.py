@@ -29,7 +29,7 @@ SHIPPED = material_names()
 
 
 def test_the_materials_of_the_report_and_of_the_workshop_ship():
-    assert {"plaster", "steel", "steel_satin", "steel_ground", "chrome"} <= set(SHIPPED)
+    assert {"plaster", "steel", "steel_satin", "steel_ground", "chrome", "brass"} <= set(SHIPPED)
     assert {"figure_8", "figure_10", "figure_11"} <= set(SHIPPED)
 
 
@@ -51,6 +51,12 @@ def test_a_shipped_material_is_sourced_and_gives_out_no_more_than_it_receives(na
             masking=material.masking,
         )
         assert (k_lm[w] + (k_ss[w] + k_sl[w] + k_s[w]) * albedo).max() <= 1 + 1e-6
+
+
+def test_brass_is_yellow_because_it_swallows_blue():
+    brass = load_material("brass")
+    red, green, blue = (conductor_fresnel(1.0, *brass.index_at(w)) for w in brass.wavelengths_um)
+    assert red > green > 0.75 and blue < 0.5 < 0.9 * red
 
 
 def test_only_figure_10_is_outside_the_theorys_assumptions_and_says_so():
