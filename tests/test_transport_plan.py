@@ -278,3 +278,42 @@ def test_the_bare_cast_of_a_picture_casts_the_rays_of_that_picture():
     measured = cast_ratio(tracer, *looking(64, 64, fov=26.0, eye=(0, 60, 290)), DIRECT, repeats=1)
     # every pixel, and two shadow rays at most from each
     assert 64 * 64 < measured.rays <= 3 * 64 * 64 and measured.ratio > 0
+
+
+def test_each_material_gets_the_cheapest_form_of_its_lobe_that_the_picture_allows():
+    smooth = Material("polished", K_s=0.6, sigma_um=0.004, correlation_um=3.0, wavelengths_um=GREY_UM)
+    room = Scene(
+        join([floor(200.0, -50.0), ball(4)]),
+        (smooth, SATIN),
+        material_of_part=(0, 1),
+        sources=LAMPS,
+        surroundings=gradient(0.05, 0.5),
+    )
+    tracer = Tracer(room)
+    camera, pose = looking(24, 24, fov=26.0, eye=(0, 60, 290))
+    plan = make_plan(tracer, camera, pose, tolerance=0.02)
+    assert plan.forms == ("smooth", "fast")
+    said = "\n".join(plan.explain())
+    assert "lobe of polished: the smooth form" in said and "lobe of satin: the fast form, within 0.1 % of the series" in said
+    same = [render(tracer, camera, pose, plan=replace(plan, forms=forms)) for forms in (plan.forms, ())]
+    assert difference(*same) < 0.2 * 0.02
+
+
+def test_nearly_grey_scenes_are_computed_at_one_wavelength_where_the_tolerance_allows():
+    nearly = Material("nearly white", K_lm=(0.801, 0.8, 0.799), wavelengths_um=(0.65, 0.55, 0.45))
+    tracer = Tracer(Scene(ball(3), (nearly,), sources=LAMPS[:1]))
+    plan = make_plan(tracer, *looking(16, 16), tolerance=0.02)
+    assert plan.grey and any("the others differ by" in line for line in plan.explain())
+    assert not make_plan(tracer, *looking(16, 16), tolerance=0.0002).grey
+
+
+def test_diffuse_light_is_looked_up_where_interpolation_is_good_enough_and_says_so():
+    tracer = Tracer(scene("ball plaster sky"))
+    camera, pose = looking(24, 24, fov=26.0, eye=(0, 60, 290))
+    plan = make_plan(tracer, camera, pose, tolerance=0.02)
+    assert plan.settings.diffuse and plan.settings.gather_diffuse == "cache"
+    assert any("diffuse light: looked up;" in line for line in plan.explain())
+    # on a ball that sees nothing of itself what the sky gives is all, and the paths' picture knows it
+    full = tracer.render(camera, pose, Settings(passes=64, each=4, depth=4), seed=9)
+    noise = full.standard_error() / full.mean_radiance
+    assert difference(render(tracer, camera, pose, plan=plan), full) < math.hypot(0.02, noise)
