@@ -18,6 +18,7 @@ from rangecheck.arrays import BoolArray, FloatArray, IntArray
 from rangecheck.errors import SurfaceError
 from rangecheck.kernels import in_chunks, kernel, thread_count
 from rangecheck.maps import Maps, trace_maps
+from rangecheck.maps.trace import Caster
 from rangecheck.scan import RangeScan
 from rangecheck.surface import Surface
 
@@ -277,11 +278,11 @@ class Outline:
     worst_px: float
 
 
-def outline_of(surface: Surface, scan: RangeScan) -> Outline:
-    """Compare the surface's picture from the scan's camera with what the scan saw."""
+def outline_of(surface: Surface, scan: RangeScan, caster: Caster | None = None) -> Outline:
+    """Compare the surface's picture from the scan's camera with what the scan saw; `caster` of the surface is built when not given."""
     import cv2
 
-    maps = trace_maps(surface, scan.camera, scan.world_from_scan, allow_inside=True)
+    maps = trace_maps(surface, scan.camera, scan.world_from_scan, caster, allow_inside=True)
     valid, hit = scan.valid, maps.hit
     count = max(1, int(valid.sum()))
     away = cv2.distanceTransform((~hit).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)

@@ -23,7 +23,7 @@ from rangecheck.config import Settings
 from rangecheck.export.mapped import coloured_map
 from rangecheck.export.pictures import write_png
 from rangecheck.files import write_json
-from rangecheck.maps import Maps, trace_maps, values_seen
+from rangecheck.maps import Maps, trace_maps
 from rangecheck.optics import PinholeCamera
 from rangecheck.pipeline.outcome import document
 from rangecheck.raycast import EmbreeCaster
@@ -56,7 +56,7 @@ def judge(
     seen = _near_seen(surface, faces_seen(views, len(surface.faces)))
     found = measure_consistency(surface, seen, most=JUDGED)
     speckle = speckle_of(frames)
-    outlines = {scan.name: outline_of(surface, scan) for scan in scans}
+    outlines = {scan.name: outline_of(surface, scan, caster) for scan in scans}
     machine = printer(settings.solid.printer or PRINTER)
     height = float(np.ptp(surface.bounds_mm[:, 1]))
     wanted = settings.solid.height_mm or height
@@ -115,12 +115,16 @@ def _lines(found: Consistency, speckle: Speckle | None, outlines: dict[str, Any]
 def _drawn(surface: Surface, found: Consistency, views: Sequence[Maps]) -> list[npt.NDArray[np.uint8]]:
     """Slope residuals in colour from the first view and the one opposite, flagged places ringed."""
     import cv2
+    from scipy.spatial import cKDTree
 
-    spread = _over_vertices(surface, found)
+    known = np.flatnonzero(np.isfinite(found.residual_deg))
+    judged = cKDTree(surface.triangles[known].mean(axis=1))
     high = max(4 * found.slope_noise_deg, 1e-6)
     pictures = []
     for maps in (views[0], views[len(views) // 2]):
-        values = values_seen(surface, maps, spread)
+        values = np.full(maps.hit.shape, np.nan)
+        near = judged.query(maps.points_mm()[maps.hit], min(4, len(known)))[1].reshape(int(maps.hit.sum()), -1)
+        values[maps.hit] = found.residual_deg[known][near].mean(axis=1)
         picture = coloured_map(
             values, "Slopes that do not fit their neighbours", "deg", low=0.0, high=high, colours="magma", picture_px=VIEW_PX
         )
@@ -151,16 +155,6 @@ def _moved(maps: Maps, points: Any) -> Any:
     from rangecheck.rigid import inverse, move_points
 
     return move_points(inverse(maps.world_from_camera), points)
-
-
-def _over_vertices(surface: Surface, found: Consistency) -> Any:
-    """(v,) the mean residual of the judged facets within a few facets of each vertex; the surface's level where none is near."""
-    from scipy.spatial import cKDTree
-
-    known = np.flatnonzero(np.isfinite(found.residual_deg))
-    middles = surface.triangles[known].mean(axis=1)
-    near = cKDTree(middles).query(surface.vertices, min(4, len(known)))[1].reshape(len(surface.vertices), -1)
-    return found.residual_deg[known][near].mean(axis=1)
 
 
 def write_consistency(folder: str | Path, content: dict[str, Any], pictures: Sequence[npt.NDArray[np.uint8]]) -> list[Path]:

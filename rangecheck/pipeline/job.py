@@ -35,6 +35,7 @@ from rangecheck.pipeline.views import map_at, orbit_of
 from rangecheck.progress import Reporter
 from rangecheck.reflectance import load_material
 from rangecheck.report import write_report
+from rangecheck.scan import RangeScan
 from rangecheck.solid import Finding, Verdict, finding, verdict
 from rangecheck.surface import INVENTED, ORIGIN_NAMES, Surface
 

@@ -158,6 +158,7 @@ class Rendered:
     frames: list[Path]
     film: Path
     plan: list[str]
+    mirrors: bool = False
 
 
 def render_turntable(
@@ -176,7 +177,7 @@ def render_turntable(
     made = _frames(surface, material_name, orbit, frames_dir, settings, reporter, force=force, scheduler=scheduler)
     with reporter.stage(f"film, {made.name}"):
         write_film(made.pictures(), film, settings.turntable.fps)
-    return Rendered(made.name, made.frames, film, made.plan)
+    return Rendered(made.name, made.frames, film, made.plan, any(_mirrors(m) for m in made.job.scene.materials))
 
 
 @dataclass(frozen=True)
@@ -331,7 +332,7 @@ def turntable(
     judged: dict[str, Any] | None = None
     if consistency:
         with reporter.stage("consistency"):
-            mirrored = next((m for m in made if m.job.plan is not None and _mirrors(load_material(m.name))), None)
+            mirrored = next((m for m in made if m.job.plan is not None and any(map(_mirrors, m.job.scene.materials))), None)
             shown = () if mirrored is None else mirrored.pictures()
             judged, said, pictures = judge(subject.surface, subject.scans, orbit, settings, shown)
             write_consistency(folder, judged, pictures)
