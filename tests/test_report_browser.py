@@ -11,6 +11,8 @@ import pytest
 from browser import Page, browser, chromium
 from report_cases import job_of_a_vase
 
+from rangecheck.report import ReportContent, Turntable, write_report
+
 pytestmark = pytest.mark.skipif(chromium() is None, reason="Chromium is not installed: apt-get install chromium")
 READY = "!data.model || document.getElementById('view').dataset.ready"
 
@@ -188,3 +190,18 @@ def test_without_webgl_the_rest_still_works(tab, job):
         assert tab.run("document.getElementById('view-frame').hidden")
     finally:
         tab.call("Page.removeScriptToEvaluateOnNewDocument", identifier=script["identifier"])
+
+
+def test_a_turntable_that_starts_elsewhere_shows_the_frame_of_the_azimuth(tab, tmp_path):
+    frames = []
+    for k in range(4):
+        frames.append(tmp_path / f"{k}.png")
+        cv2.imwrite(str(frames[-1]), np.full((8, 8, 3), 60 * k, np.uint8))
+    tables = [Turntable("plaster", frames, start_deg=90.0)]
+    write_report(ReportContent("turned", True, "Only frames.", [], turntables=tables), tmp_path / "report.html")
+    tab.open(tmp_path / "report.html")
+    for azimuth, frame in ((90, 0), (180, 1), (0, 3)):
+        tab.run(
+            f"document.getElementById('angle').value = {azimuth}; document.getElementById('angle').dispatchEvent(new Event('input'))"
+        )
+        assert tab.run(f"document.querySelector('img.turned').src === data.tables[0].frames[{frame}]")

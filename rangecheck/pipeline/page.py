@@ -175,6 +175,11 @@ def page_of(folder: Path, content: dict[str, Any], studies: Sequence[str | Path]
             Finding(f["code"], f["severity"], f["count"], f["message"], f["why"], f["mend"], np.reshape(f["places_mm"], (-1, 3)))
             for f in content["verdict"]["findings"]
         ],
+        shown=[
+            Figure("Consistency", "", read_bytes(path), alt=f"Places that the turntable flags, from the {side}")
+            for side in ("front", "back")
+            if (path := folder / "consistency" / f"consistency_{side}.png").is_file()
+        ],
         charts=[figure for study in studies for figure in _charts(Path(study))],
         decisions=[*content["decisions"], *(f"{t['material']}: {line}" for t in content["turntables"] for line in t["plan"])],
         settings=json.dumps(content["settings"], indent=1),
@@ -193,6 +198,7 @@ _FILES = (
     ("plaster.mp4", "turntable in plaster"),
     ("steel.mp4", "turntable in steel"),
     ("stripes.mp4", "turntable in mirrored stripes"),
+    ("consistency", "what the turntable shows, measured"),
     ("maps", "distance, depth, normals and IDs, full precision"),
     ("contours", "iso-lines of depth of every scan"),
     ("run.json", "verdict with places, decisions, versions, input hashes, timings"),

@@ -133,7 +133,8 @@ class DistanceMap:
 @dataclass(frozen=True)
 class ReportContent:
     """Everything the report shows. `worth` are facts about all scans together, `remarks`
-    (severity, sentence) what is to be said of them; `provenance` are groups of facts by heading.
+    (severity, sentence) what is to be said of them; `shown` are
+    pictures of what the turntable shows, measured; `provenance` are groups of facts by heading.
 
     Azimuths of turntables and focal points count from the front, which lies `front_deg` from +z towards +x."""
 
@@ -150,6 +151,7 @@ class ReportContent:
     distance_maps: Sequence[DistanceMap] = ()
     front_deg: float = 0.0
     findings: Sequence[Finding] = ()
+    shown: Sequence[Figure] = ()
     charts: Sequence[Figure] = ()
     decisions: Sequence[str] = ()
     settings: str = "{}"

@@ -40,7 +40,10 @@ async function startViewer() {
   shape.setAttribute("color", new THREE.BufferAttribute(new Float32Array(model.positions.length), 3));
   shape.setIndex(new THREE.BufferAttribute(model.faces, 1));
   const cut = new THREE.Plane(new THREE.Vector3(0, 0, -1), 0);
-  const skin = new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 0.85 });
+  const { closed } = data.model;
+  const skin = new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 0.85, side: closed ? THREE.DoubleSide : THREE.FrontSide });
+  // a sliver that simplification turned over is still skin: it is lit by the normals of its corners, whichever way it faces
+  skin.onBeforeCompile = (shader) => { shader.fragmentShader = shader.fragmentShader.replace("#include <normal_fragment_begin>", "float faceDirection = 1.0; vec3 normal = normalize( vNormal ); vec3 nonPerturbedNormal = normal;"); };
   const inside = new THREE.MeshBasicMaterial({ side: THREE.BackSide });
   // the section of a closed surface: the plane wherever a ray through the pixel leaves the surface more often than it enters it
   const tally = (side, change) => new THREE.MeshBasicMaterial({ side, depthTest: false, depthWrite: false, colorWrite: false, stencilWrite: true, stencilFail: change, stencilZFail: change, stencilZPass: change, clippingPlanes: [] });
@@ -55,7 +58,9 @@ async function startViewer() {
   const marks = new THREE.Group();
   marks.renderOrder = 9;
   const scene = new THREE.Scene(), camera = new THREE.PerspectiveCamera(25, 1, radius / 100, radius * 20), lamp = new THREE.DirectionalLight(0xffffff, 2.3);
-  scene.add(bust, new THREE.Mesh(shape, inside), capped, marks, new THREE.HemisphereLight(0xffffff, 0x9a948a, 1.35), camera);
+  const back = new THREE.Mesh(shape, inside);
+  back.visible = !closed;
+  scene.add(bust, back, capped, marks, new THREE.HemisphereLight(0xffffff, 0x9a948a, 1.35), camera);
   lamp.position.set(-0.5, 0.7, 1); camera.add(lamp, lamp.target); lamp.target.position.set(0, 0, -1);
 
   let wanted = 0, quiet = 0;
@@ -159,7 +164,7 @@ async function startViewer() {
     skin.clippingPlanes = inside.clippingPlanes = whole ? null : [cut];
     for (const material of counted) material.clippingPlanes = [cut];
     skin.needsUpdate = inside.needsUpdate = true;
-    capped.visible = !whole && data.model.closed;
+    capped.visible = !whole && closed;
     if (whole) cutAt.textContent = "–";
     else {
       const k = Number(axis), at = low[k] + (slider.value / 1000) * (high[k] - low[k]), way = flip.checked ? 1 : -1;
@@ -184,6 +189,11 @@ async function startViewer() {
     ray.setFromCamera(spot, camera);
     const hit = ray.intersectObject(bust).find((h) => !skin.clippingPlanes || cut.distanceToPoint(h.point) >= 0);
     if (!hit) { reading.textContent = ""; return; }
+    if (capped.visible && hit.face.normal.dot(ray.ray.direction) > 0) {
+      const place = ray.ray.intersectPlane(cut, new THREE.Vector3());
+      reading.textContent = place ? `${point(place.toArray())} · section` : "";
+      return;
+    }
     const corners = [hit.face.a, hit.face.b, hit.face.c], at = corners.reduce((best, i) => {
       const d = hit.point.distanceToSquared(new THREE.Vector3().fromBufferAttribute(shape.getAttribute("position"), i));
       return d < best[0] ? [d, i] : best;
