@@ -95,6 +95,19 @@ def test_both_sides_of_an_open_surface_keep_their_own_light():
     assert below == pytest.approx(np.full_like(below, 0.8 * 1 / 6), rel=0.03)
 
 
+def test_sides_that_keep_nothing_are_followed_path_by_path():
+    # a closed ball keeps light outside only; a camera in it sees the other side of its faces
+    scene = Scene(ball(3, 100.0), (WHITE,), sources=(lamp((0, 0, 0), 5.0, 20.0),))
+    camera, flux = PinholeCamera.from_field_of_view(16, 16, 60.0), 4 * math.pi * math.pi * 5.0**2 * 20.0
+    pose = np.eye(4)
+    pose[2, 3] = 50.0
+    film = Tracer(scene).render(camera, pose, replace(KEPT, passes=32, depth=3, shadow_rays=0))
+    truth = light.enclosure_radiance(0.8, flux, 100.0, 3)
+    error = math.sqrt(film.variance.mean() / film.variance.size)
+    # 1280 flat faces: (edge/2)^2/(2 r^2) of 15 mm edges, three times over for each of three scatterings
+    assert film.mean_radiance == pytest.approx(truth, abs=4 * error + 9 * 7.5**2 / (2 * 100.0**2) * truth)
+
+
 def test_the_cache_is_the_same_on_any_number_of_threads_and_for_every_picture():
     scene = Scene(join([floor(200.0), ball(3, 30.0, (0, 30, 0))]), (WHITE,), sources=(lamp((150, 250, 100), 30.0, 20.0),))
     camera, pose = looking(40, 30, eye=(0, 150, 250))

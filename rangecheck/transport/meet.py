@@ -81,7 +81,7 @@ def meet(geometry, sources, surroundings, stored, rays, n, reflections, backdrop
         hit_pixel[count], hit_first[count], hit_stream[count] = pixel, firsts[i], streams[i]
         hit_material[count], hit_number[count] = materials[face], numbers[i]
         settled[count] = False
-        if sides > 0:
+        if sides > 0 and reflections + 1 < tally.shape[1]:
             out = 0.0
             for axis in range(3):
                 out += facing[count, axis] * normals[face, axis]
