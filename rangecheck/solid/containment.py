@@ -71,7 +71,7 @@ def shell_sizes(vertices, faces, shell, count):
 
 def shell_depths(surface: Surface, count: int, shell: IntArray) -> IntArray:
     """(count,) in how many other shells each closed shell lies. A shell is asked about by one point that touches no other shell's box
-    face exactly, its first vertex; only shells whose box holds that point are looked at."""
+    face exactly, its first vertex; only shells whose box holds its own are looked at."""
     if count < 2:
         return np.zeros(count, np.int64)
     order = np.argsort(shell, kind="stable")
@@ -82,7 +82,8 @@ def shell_depths(surface: Surface, count: int, shell: IntArray) -> IntArray:
     depth = np.zeros(count, np.int64)
     for i in range(count):
         x, y, z = pieces[i][0, :3]
-        around = np.flatnonzero(((low <= (x, y, z)) & (high >= (x, y, z))).all(axis=1))
+        # one that only runs into another is not inside it: a box within a box is the least that inside means
+        around = np.flatnonzero(((low <= low[i]) & (high >= high[i])).all(axis=1))
         for j in around[around != i]:
             depth[i] += abs(round(solid_angle(pieces[j], x, y, z) / (4 * math.pi))) % 2
     return depth

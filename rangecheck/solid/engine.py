@@ -131,3 +131,11 @@ def prism(section: Any, low_mm: float, high_mm: float) -> Any:
 def hull_of(solids: Sequence[Any]) -> Any:
     """The convex hull of the engine's solids."""
     return _manifold3d().Manifold.batch_hull(list(solids))
+
+
+def united(surface: Surface, new_part: str = "united") -> Surface:
+    """The union of all shells of a surface, each closed and manifold by itself; faces keep part and origin. Raises NotSolid, with the engine's
+    word, where a shell is not."""
+    solid, number = to_engine(surface)
+    whole = _manifold3d().Manifold.batch_boolean(solid.decompose(), _manifold3d().OpType.Add)
+    return from_engine(whole, [(number, surface)], new_part)

@@ -117,7 +117,7 @@ def _islands(solid: BoolArray) -> tuple[int, int]:
     from scipy import ndimage
 
     flat = np.zeros((3, 3, 3), bool)
-    flat[:, :, 1] = ndimage.generate_binary_structure(2, 1)
+    flat[:, :, 1] = True
     label, count = ndimage.label(solid, flat)
     below = np.zeros_like(solid)
     spread = np.zeros((3, 3, 3), bool)

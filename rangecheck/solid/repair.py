@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 
 from rangecheck.arrays import IntArray
-from rangecheck.errors import SettingError
+from rangecheck.errors import NotSolid, SettingError
 from rangecheck.solid.checks import NOISE_SHARE
+from rangecheck.solid.containment import shell_volumes_mm3
+from rangecheck.solid.engine import united
 from rangecheck.solid.findings import Verdict
 from rangecheck.solid.holes import fill_holes
 from rangecheck.solid.rounding import collapse_flat_faces
@@ -112,6 +114,7 @@ def repair(
         mended = filled.surface
     if len(topo.non_manifold_vertices(mended)):
         mended = _parted(mended, max_move_mm, steps, refused)
+    mended = _united(mended, steps)
     mended = _untangled(mended, max_move_mm, max_vanished, steps, refused)
     if len(topo.degenerate_faces(mended)):
         count = len(topo.degenerate_faces(mended))
@@ -222,6 +225,24 @@ def _parted(surface: Surface, max_move_mm: float, steps: list[Step], refused: li
         Step("part-sheets", parted.doubled, f"{parted.doubled} vertices doubled, drawn apart by {parted.moved_mm:.2g} mm")
     )
     return parted.surface
+
+
+def _united(surface: Surface, steps: list[Step]) -> Surface:
+    """Bodies that run into each other made one: what lies inside another goes, and no point of the outside moves."""
+    count, shell = topo.shells(surface)
+    if count < 2 or not topo.is_closed(surface) or (shell_volumes_mm3(surface, count, shell) <= 0).any():
+        return surface
+    met = shell[self_intersections(surface).of_kind(CROSSING, OVERLAP)]
+    if not (met[:, 0] != met[:, 1]).any():
+        return surface
+    try:
+        whole = united(surface)
+    except NotSolid:
+        return surface
+    left = topo.shells(whole)[0]
+    message = f"{count} bodies, some running into each other, united to {left}; what lay inside another is gone"
+    steps.append(Step("unite-bodies", count - left, message))
+    return whole
 
 
 def _untangled(surface: Surface, max_move_mm: float, max_vanished: float, steps: list[Step], refused: list[str]) -> Surface:

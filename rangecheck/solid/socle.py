@@ -41,13 +41,14 @@ def with_socle(surface: Surface, *, up: npt.ArrayLike = UP, height_mm: float | N
         return prism(cross_section(standing, margin), bottom + low, bottom + high)
 
     thin = 1e-3 * tall
-    cove = hull_of([slab(plinth, -0.62 * tall, -0.62 * tall + thin), slab(neck, -0.25 * tall - thin, -0.25 * tall)])
+    # a little narrower below and wider above than what it joins: no two walls in one plane
+    cove = hull_of([slab(0.96 * plinth, -0.62 * tall, -0.62 * tall + thin), slab(1.2 * neck, -0.25 * tall - thin, -0.25 * tall)])
     socle = slab(plinth, -tall, -0.6 * tall) + cove + slab(neck, -0.26 * tall, REACH * small)
     part, number = to_engine(surface)
     united = part + socle.transform(np.column_stack([frame.T, np.zeros(3)]))
     sources = [(number, surface)]
     if nameplate:
-        plate = _nameplate(nameplate, standing @ frame[:2] + (bottom - 0.8 * tall) * frame[2], plinth, 0.4 * tall, frame)
+        plate = _nameplate(nameplate, standing @ frame[:2] + (bottom - 0.8 * tall) * frame[2], plinth, 0.3 * tall, frame)
         carved = from_engine(plate, [], "nameplate", INVENTED)
         solid, name = to_engine(carved)
         united, sources = united + solid, [*sources, (name, carved)]
