@@ -23,6 +23,7 @@ STUDIES = {
     "registration": "rangecheck.studies.registration",
     "transport": "rangecheck.studies.transport",
     "rays": "rangecheck.studies.rays",
+    "repair": "rangecheck.studies.repair",
     "renderers": "rangecheck.studies.renderers",
 }
 
