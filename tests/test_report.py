@@ -12,6 +12,7 @@ from report_cases import job_of_a_vase, vase
 from rangecheck.optics import PinholeCamera
 from rangecheck.pipeline import likeness as likenesses
 from rangecheck.pipeline.likeness import coverage, lighter, likeness
+from rangecheck.pipeline.page import page_of
 from rangecheck.report import Coverage, Figure, ReportContent, report_html
 from rangecheck.report.pack import octahedral, packed, packed_floats, unpacked
 from rangecheck.report.sphere import halves, seen_share
@@ -154,3 +155,15 @@ def test_large_pictures_become_lighter():
     content = ReportContent("t", True, "v", [], scans=[Scan("s", [], [Figure("Contours", "", png_bytes(noise), "noise")])])
     page = report_html(content)
     assert "data:image/webp" in page and len(page) < len(png_bytes(noise))
+
+
+def test_what_could_not_be_told_is_said_to_be_unknown(job, tmp_path):
+    """A cloud has no grid, and numbers that are not numbers are null in JSON."""
+    content = json.loads((job / "run.json").read_text())
+    content["scans"][0] = {"name": "cloud", "camera": None, "unit": "mm", "valid": 1234, "valid_share": 1.0}
+    content["quality"] |= {"expected_error_mm": None, "spacing_mm": None, "next_view": None}
+    page = page_of(tmp_path, content)
+    assert page.model is None and page.coverage is None and not page.distance_maps and not page.turntables
+    assert "1,234" in page.scans[0].facts[0][1]
+    assert ("Expected error", "unknown") in page.worth
+    assert "1,234, a cloud" in report_html(page)

@@ -162,7 +162,7 @@ def page_of(folder: Path, content: dict[str, Any], studies: Sequence[str | Path]
         scans=[_scan(folder, facts, quality) for facts in content["scans"]],
         worth=_worth(quality),
         remarks=[(found["severity"], found["text"]) for found in (quality or {}).get("findings", ())],
-        coverage=None if kept is None else _coverage(kept["coverage"], quality),
+        coverage=None if kept is None or not kept["coverage"].any() else _coverage(kept["coverage"], quality),
         model=None if kept is None else _model(kept),
         front_deg=content.get("front_deg", 0.0),
         turntables=[
@@ -216,31 +216,34 @@ def _reasons(content: dict[str, Any]) -> list[str]:
     reasons.append("of the surface, " + ", ".join(f"{share:.1%} is {name}" for name, share in shares.items()))
     if quality:
         reasons.append(
-            f"the scans are {quality['verdict']} for {quality['profile']['name']}: expected error {quality['expected_error_mm']:.3f} mm, "
+            f"the scans are {quality['verdict']} for {quality['profile']['name']}: expected error {_length(quality['expected_error_mm'], 3)}, "
             f"{quality['never_seen']:.1%} of the surface in reach never seen"
         )
     reasons.append(f"meshed by {content['method']}: {content['reason']}")
     return list(dict.fromkeys(reasons))[:3]
 
 
+_SHARES = (("Grazing", "grazing"), ("Confirmed by others", "overlap"))
+
+
+def _length(value: float | None, digits: int) -> str:
+    """Millimetres in words; a length that could not be told is null in JSON."""
+    return "unknown" if value is None else f"{value:.{digits}f} mm"
+
+
 def _scan(folder: Path, facts: dict[str, Any], quality: dict[str, Any] | None) -> Scan:
     name = facts["name"]
-    rows = []
-    if facts.get("valid_share") is not None:
-        rows.append(("Readings", f"{facts['valid']:,} ({facts['valid_share']:.0%} of {facts['width']} × {facts['height']})"))
-    else:
-        rows.append(("Readings", f"{facts['valid']:,}"))
-    rows.append(("Distances", f"{facts['nearest_mm']:.1f} to {facts['farthest_mm']:.1f} mm"))
-    if facts.get("spacing_mm"):
-        rows.append(("Spacing", f"{facts['spacing_mm']:.2f} mm"))
+    if facts["camera"] is None:
+        return Scan(name, [("Points", f"{facts['valid']:,}, a cloud without a grid")])
+    rows = [
+        ("Readings", f"{facts['valid']:,} ({facts['valid_share']:.0%} of {facts['width']} × {facts['height']})"),
+        ("Distances", f"{facts['nearest_mm']:.1f} to {facts['farthest_mm']:.1f} mm"),
+        ("Spacing", _length(facts["spacing_mm"], 2)),
+    ]
     view = next((v for v in (quality or {}).get("views", ()) if v["name"] == name), None)
+    rows.append(("Noise", _length(facts["noise_mm"] if view is None else view["noise_mm"], 3)))
     if view is not None:
-        rows.append(("Noise", f"{view['noise_mm']:.3f} mm"))
-        rows.append(("Grazing", f"{view['grazing']:.0%}"))
-        if view["overlap"] is not None:
-            rows.append(("Confirmed by others", f"{view['overlap']:.0%}"))
-    elif facts.get("noise_mm"):
-        rows.append(("Noise", f"{facts['noise_mm']:.3f} mm"))
+        rows += [(label, f"{view[key]:.0%}") for label, key in _SHARES if view[key] is not None]
     pictures = [
         Figure(kind, "", read_bytes(path), alt=f"{kind} of {name}")
         for kind in ("Brightness", "Contours")
@@ -256,8 +259,8 @@ def _worth(quality: dict[str, Any] | None) -> list[tuple[str, str]]:
     return [
         ("Worth", f"{quality['verdict']} for {quality['profile']['name']}"),
         ("Never seen", f"{quality['never_seen']:.1%} of the surface in reach, in {quality['gaps']} gaps"),
-        ("Readings", f"{quality['spacing_mm']:.2f} mm apart"),
-        ("Expected error", f"{quality['expected_error_mm']:.3f} mm"),
+        ("Readings apart", _length(quality["spacing_mm"], 2)),
+        ("Expected error", _length(quality["expected_error_mm"], 3)),
     ]
 
 
