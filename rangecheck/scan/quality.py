@@ -260,13 +260,19 @@ def _over_surface(
         flat_on = sample.spacing_mm / sample.stride * math.sqrt(float(np.median(cosine)))
         with np.errstate(divide="ignore"):
             finest = np.where(looked, np.minimum(finest, flat_on / np.sqrt(cosines)), finest)
-            weight += np.where(looked, 1.0 / ((sample.noise_mm * cosines) ** 2 + step_mm**2 + 1e-12), 0.0)
+            weight += np.where(looked, 1.0 / ((_noise_mm(scan, sample) * cosines) ** 2 + step_mm**2 + 1e-12), 0.0)
     at = tuple(shell.index[shell.measured].T)
     looked = weight[at] > 0
     area = shell.area_mm2[shell.measured][looked]
     if not len(area):
         return math.nan, math.nan
     return float(np.median(finest[at][looked])), math.sqrt(float(np.average(1.0 / weight[at][looked], weights=area)))
+
+
+def _noise_mm(scan: RangeScan, sample: Samples) -> float:
+    """What a reading errs by: what its neighbours show, or what the scanner states if that is more, for errors that neighbours share do
+    not show among them."""
+    return max(sample.noise_mm, scan.noise_mm or 0.0)
 
 
 def _coverage(points: FloatArray, middle: FloatArray) -> float:
@@ -288,7 +294,7 @@ def _view(k: int, scans, samples: Sequence[Samples], judged, middle: FloatArray,
     return ViewQuality(
         scan.name, int(scan.valid.sum()), float(scan.valid.mean()), sample.spacing_mm / sample.stride, sample.noise_mm, scan.noise_mm,
         float((cosine < math.cos(math.radians(GRAZING_DEG))).mean()), float(np.nanmedian(scan.range_mm)), azimuth, elevation, overlap,
-        sample.noise_mm * float(np.sqrt(np.mean(np.clip(cosine, 0, 1) ** 2))),
+        _noise_mm(scan, sample) * float(np.sqrt(np.mean(np.clip(cosine, 0, 1) ** 2))),
     )  # fmt: skip
 
 

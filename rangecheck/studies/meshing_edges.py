@@ -75,7 +75,7 @@ def outcome(method: str, knob: str, value: float, width: int) -> tuple[float, in
 
 def edges(quick: bool) -> Part:
     """The edge of every method for every knob, by its error and by its closedness."""
-    width, samples, tolerance = (80, 2, 0.5) if quick else (200, 6, 0.06)
+    width, samples, tolerance = (80, 2, 0.5) if quick else (320, 5, 0.08)
     charts, findings, rows = [], [], []
     for knob in ("noise",) if quick else KNOBS:
         label, start, stop, logarithmic = KNOBS[knob]
