@@ -200,12 +200,21 @@ def _on_cluster(arguments: Sequence[str], film: Path, frames: int) -> str:
             return process
 
         where = Path(name) / "scheduler.json"
-        start("distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard", "--scheduler-file", str(where))
+        start(
+            "distributed.cli.dask_scheduler",
+            "--host",
+            "127.0.0.1",
+            "--port",
+            "0",
+            "--no-dashboard",
+            "--scheduler-file",
+            str(where),
+        )
         deadline = time.monotonic() + 60
         while not where.is_file() and time.monotonic() < deadline:
             time.sleep(0.05)
         address = json.loads(where.read_text())["address"]
-        options = ("--nthreads", "1", "--no-nanny", "--no-dashboard", "--local-directory", name)
+        options = ("--host", "127.0.0.1", "--nthreads", "1", "--no-nanny", "--no-dashboard", "--local-directory", name)
         workers = [start("distributed.cli.dask_worker", address, *options) for _ in range(2)]
         process = subprocess.Popen(_line(*arguments, "--scheduler", address), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
         _wait_for(process, film, frames // 3)
