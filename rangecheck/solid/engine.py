@@ -1,4 +1,4 @@
-"""The one adapter of manifold3d (3.5): to it and back, keeping which face came from which.
+"""Surfaces to manifold3d (3.5) and back, keeping which face came from which; how it is loaded and read is the modeler's adapter.
 
 Its traps: float32 `Mesh` rounds, so `Mesh64` is used throughout; a refused mesh becomes an empty solid whose `status()` says why and
 which empties whatever it meets; `simplify` collapses edges between faces of the same `face_id` only, so every face gets its own unless
@@ -14,16 +14,11 @@ from typing import Any
 import numpy as np
 
 from rangecheck.arrays import FloatArray, IntArray
-from rangecheck.errors import DependencyMissing, NotSolid
+from rangecheck.errors import NotSolid
+from rangecheck.modeler.engine import manifold3d_module, mesh_of, triangulate
 from rangecheck.surface.surface import INVENTED, Surface
 
-
-def _manifold3d() -> Any:
-    try:
-        import manifold3d
-    except ImportError:
-        raise DependencyMissing("manifold3d", "solids", "pip install manifold3d") from None
-    return manifold3d
+__all__ = ["cross_section", "from_engine", "hull_of", "prism", "simplified", "to_engine", "triangulate", "united"]
 
 
 def to_engine(surface: Surface, face_id: IntArray | None = None) -> tuple[Any, int]:
@@ -31,7 +26,7 @@ def to_engine(surface: Surface, face_id: IntArray | None = None) -> tuple[Any, i
 
     `face_id` (m,) names faces that may be merged with their like by `simplify`; by default every face has its own name.
     Raises NotSolid, with the engine's word, when it is refused."""
-    m3d = _manifold3d()
+    m3d = manifold3d_module()
     name = int(m3d.Manifold.reserve_ids(1))
     faces = np.ascontiguousarray(surface.faces, np.uint64)
     mesh = m3d.Mesh64(
@@ -66,14 +61,7 @@ def simplified(surface: Surface, tolerance_mm: float) -> Surface:
 def from_engine(solid: Any, sources: Sequence[tuple[int, Surface]], new_part: str, new_origin: int = INVENTED) -> Surface:
     """The engine's solid as a surface. Faces that came from `sources` (number, surface) keep part and origin; all others belong
     to `new_part` and are of `new_origin`."""
-    mesh = solid.to_mesh64()
-    vertices = np.array(mesh.vert_properties[:, :3], np.float64)
-    faces = np.array(mesh.tri_verts, np.int64)
-    merge_from, merge_to = np.asarray(mesh.merge_from_vert, np.int64), np.asarray(mesh.merge_to_vert, np.int64)
-    if len(merge_from):
-        target = np.arange(len(vertices))
-        target[merge_from] = merge_to
-        faces = target[faces]
+    vertices, faces, mesh = mesh_of(solid)
     source_of, face_of = _provenance(mesh, len(faces))
     names: list[str] = []
     part = np.zeros(len(faces), np.int32)
@@ -109,14 +97,9 @@ def _provenance(mesh: Any, count: int) -> tuple[IntArray, IntArray]:
     return source, face
 
 
-def triangulate(rings: Sequence[FloatArray]) -> IntArray:
-    """(k, 3) triangles over the points of plane rings (n, 2) taken one after another: outer rings counter-clockwise, holes clockwise."""
-    return np.asarray(_manifold3d().triangulate([np.ascontiguousarray(r, np.float64) for r in rings]), np.int64).reshape(-1, 3)
-
-
 def cross_section(points: FloatArray | Sequence[FloatArray], margin_mm: float) -> Any:
     """Plane shape: the hull of points (n, 2) widened by a rounded margin, or rings with their holes where a sequence is given."""
-    m3d = _manifold3d()
+    m3d = manifold3d_module()
     if not isinstance(points, np.ndarray):
         return m3d.CrossSection([np.ascontiguousarray(r, np.float64) for r in points], m3d.FillRule.EvenOdd)
     hull = m3d.CrossSection.hull_points(np.ascontiguousarray(points, np.float64))
@@ -130,12 +113,12 @@ def prism(section: Any, low_mm: float, high_mm: float) -> Any:
 
 def hull_of(solids: Sequence[Any]) -> Any:
     """The convex hull of the engine's solids."""
-    return _manifold3d().Manifold.batch_hull(list(solids))
+    return manifold3d_module().Manifold.batch_hull(list(solids))
 
 
 def united(surface: Surface, new_part: str = "united") -> Surface:
     """The union of all shells of a surface, each closed and manifold by itself; faces keep part and origin. Raises NotSolid, with the engine's
     word, where a shell is not."""
     solid, number = to_engine(surface)
-    whole = _manifold3d().Manifold.batch_boolean(solid.decompose(), _manifold3d().OpType.Add)
+    whole = manifold3d_module().Manifold.batch_boolean(solid.decompose(), manifold3d_module().OpType.Add)
     return from_engine(whole, [(number, surface)], new_part)

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from rangecheck.arrays import FloatArray
 from rangecheck.errors import SettingError, SurfaceError
+from rangecheck.modeler.engine import manifold3d_module
 from rangecheck.solid.drainage import Pocket, pockets
 from rangecheck.solid.engine import from_engine, simplified, to_engine
 from rangecheck.solid.offset import inner_offset
@@ -261,12 +262,10 @@ def _drain_for(pocket: Pocket, outer: Surface, up: npt.ArrayLike, wall_mm: float
 
 def _rod(drain: Drain, radius_mm: float, wall_mm: float) -> Any:
     """A rod along the drain, half a wall longer inside and a whole wall outside."""
-    import manifold3d
-
     way = drain.outside_mm - drain.inside_mm
     length = float(np.linalg.norm(way))
     frame = frame_of(way)
-    rod = manifold3d.Manifold.cylinder(length + 1.5 * wall_mm, radius_mm, radius_mm, SIDES)
+    rod = manifold3d_module().Manifold.cylinder(length + 1.5 * wall_mm, radius_mm, radius_mm, SIDES)
     start = drain.inside_mm - 0.5 * wall_mm * frame[2]
     return rod.transform(np.column_stack([frame.T, start]))
 
