@@ -140,7 +140,7 @@ def _means(picture: FloatArray) -> FloatArray:
 
 
 def _dent_part(quick: bool) -> Part:
-    points, pixels, samples = (60, 90, 5) if quick else (200, 240, 13)
+    points, pixels, samples = (60, 90, 5) if quick else (160, 240, 9)
     smooth = cheek(points)
     surfaces = {"true surface": smooth}
     if not quick:
