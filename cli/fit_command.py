@@ -37,6 +37,7 @@ def command(
     calibrate,
     response,
     noise,
+    scale,
     irradiance,
     spike,
     out,
@@ -47,11 +48,14 @@ def command(
     reporter,
 ):
     """Recover material and lamps from photographs of a known shape, one lamp a picture, with 95 % intervals and a statement of what
-    the pictures cannot determine. The material file serves every --material."""
+    the pictures cannot determine. The material file serves every --material.
+
+    Given one scan with brightness instead of pictures: material and lamp on the scan's own surface, and the places where the scan shows a
+    shape that its picture does not (exit status 1); FILE is then a picture (.png) of where."""
     from rangecheck.pipeline import fit
 
     return fit(
         pictures, out, settings=settings_from(config, assignments), unit=unit, sphere=sphere, model=model, camera_mm=camera,
-        field_deg=field, lights=lights, calibrate=calibrate, response=response, noise=noise, spike=spike, irradiance=irradiance,
+        field_deg=field, lights=lights, calibrate=calibrate, response=response, noise=noise, spike=spike, irradiance=irradiance, scale_mm=scale,
         force=force, reporter=reporter,
     )  # fmt: skip

@@ -25,15 +25,21 @@ from rangecheck.recover.sight import Sight, lit_by, see, sphere_sight
 #: cosines below which a pixel is left out: grazing views, where the model's bound and the shape's own errors count
 _LEAST_COSINE = 0.3
 _FAR = 1e4
+_PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm")
 
 
 def fit(
     pictures: Sequence[str], out: str | None, *, settings: Any, unit: str | None, sphere: tuple[float, float, float] | None, model: str | None,
     camera_mm: tuple[float, ...] | None, field_deg: float, lights: str | None, calibrate: str | None, response: str, noise: float,
-    spike: bool, irradiance: float, force: bool, reporter: Reporter,
+    spike: bool, scale_mm: float | None, irradiance: float, force: bool, reporter: Reporter,
 ) -> Outcome:  # fmt: skip
     """Material and lamps from `pictures`, one lamp each, of a `sphere` (column, row, radius: parallel view) or a `model` seen from
-    `camera_mm`. `calibrate` (chrome or matt) finds the lamps of sphere pictures alone."""
+    `camera_mm`; or, with neither, of a scan's brightness on its own surface, and where the two contradict each other.
+    `calibrate` (chrome or matt) finds the lamps of sphere pictures alone."""
+    if sphere is None and model is None and len(pictures) == 1 and Path(pictures[0]).suffix.lower() not in _PICTURES:
+        from rangecheck.pipeline.explained import fit_scan
+
+        return fit_scan(pictures[0], out, response=response, unit=unit, scale_mm=scale_mm, force=force, reporter=reporter)
     if (sphere is None) == (model is None):
         raise SettingError("name what the pictures show: --sphere COLUMN,ROW,RADIUS or --on MESH", key="sphere")
     with reporter.stage("reading pictures"):

@@ -1,0 +1,104 @@
+"""A scan against its own brightness image: what is planted in the scan and not in the picture is named at its place, and nothing else."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rangecheck.errors import ScanError
+from rangecheck.optics import PinholeCamera
+from rangecheck.recover.compare import compare, fit_to_scan
+from rangecheck.recover.grid import normals_at, scan_grid
+from rangecheck.recover.lights import Light
+from rangecheck.scan import RangeScan
+
+SIZE, RADIUS_MM, AWAY_MM = 200, 80.0, 600.0
+LAMP = np.array([0.5, -0.4, -0.77]) / np.linalg.norm([0.5, -0.4, -0.77])
+
+
+def ball_scan(range_noise_mm=0.02, picture_noise=0.01, paint=0.0, seed=0):
+    """A matt ball seen by a pinhole camera from which a far lamp stands up and to the right; 1 mm to a pixel or so."""
+    rng = np.random.default_rng(seed)
+    camera = PinholeCamera.from_field_of_view(SIZE, SIZE, 16.0)
+    _, rays = camera.pixel_rays()
+    centre = np.array([0.0, 0.0, AWAY_MM])
+    b = rays @ centre
+    inside = b * b - (AWAY_MM**2 - RADIUS_MM**2)
+    distance = b - np.sqrt(np.where(inside > 0, inside, np.nan))
+    points = distance[..., None] * rays
+    normals = (points - centre) / RADIUS_MM
+    seen = -(normals * rays).sum(-1) > 0.25
+    albedo = 0.7 * (1.0 + paint * (np.sin(points[..., 0] / 3.0) * np.sin(points[..., 1] / 4.0) > 0.3))
+    bright = albedo * np.maximum((normals * LAMP).sum(-1), 0.0) + rng.normal(0, picture_noise, (SIZE, SIZE))
+    ranges = np.where(seen, distance + rng.normal(0, range_noise_mm, (SIZE, SIZE)), np.nan)
+    return RangeScan(
+        ranges.astype(np.float32), camera, brightness=np.clip(bright, 0, 1).astype(np.float32), noise_mm=range_noise_mm
+    )
+
+
+@pytest.fixture(scope="module")
+def clean():
+    scan = ball_scan()
+    fitted = fit_to_scan(scan_grid(scan), 2.5, pixels=1500)
+    return scan, fitted, compare(scan, scale_mm=2.5, fitted=fitted)
+
+
+def dented(scan, row, column, depth_mm=1.0, radius_mm=10.0):
+    points = scan.grid_points_mm
+    apart = np.linalg.norm(points - points[row, column], axis=-1)
+    deeper = np.where(apart < radius_mm, 0.5 * depth_mm * (1 + np.cos(np.pi * np.minimum(apart / radius_mm, 1))), 0.0)
+    return replace(scan, range_mm=(scan.range_mm + deeper).astype(np.float32))
+
+
+def test_normals_of_a_scanned_ball_are_those_of_the_ball():
+    scan = ball_scan(range_noise_mm=0.0)
+    grid = scan_grid(scan)
+    truth = (grid.points - [0, 0, AWAY_MM]) / RADIUS_MM
+    well = -(truth * grid.rays).sum(-1) > 0.5
+    away = np.degrees(np.arccos(np.clip((normals_at(grid, 2.5) * truth).sum(-1), -1, 1)))
+    assert np.nanmedian(away[well]) < 0.2 and np.nanquantile(away[well], 0.99) < 1.0
+
+
+def test_the_lamp_of_a_scan_s_picture_is_found_on_its_own_surface(clean):
+    _, fitted, _ = clean
+    light: Light = fitted.problem.lights[0]
+    centre = np.array([0.0, 0.0, AWAY_MM])
+    towards = light.centre_mm - centre
+    assert np.degrees(np.arccos(towards @ LAMP / np.linalg.norm(towards))) < 3.0
+
+
+def test_nothing_is_named_where_scan_and_picture_are_of_the_same_thing(clean):
+    assert clean[2].regions == ()
+    assert clean[2].judged > 0.5
+
+
+def test_a_dent_that_the_picture_does_not_show_is_named_at_its_place(clean):
+    scan, fitted, _ = clean
+    found = compare(dented(scan, 110, 90), scale_mm=2.5, fitted=fitted)
+    assert len(found.regions) >= 1
+    assert all(np.linalg.norm(np.subtract(r.middle_mm, scan.grid_points_mm[110, 90])) < 12.0 for r in found.regions)
+    assert "shape" in {r.kind for r in found.regions}
+
+
+def test_a_step_between_two_halves_of_a_scan_is_named_as_one_of_registration(clean):
+    scan, fitted, _ = clean
+    ranges = scan.range_mm.copy()
+    ranges[:, 120:] += 0.3
+    found = compare(replace(scan, range_mm=ranges), scale_mm=0.8, fitted=fitted)
+    worst = found.regions[0]
+    assert worst.kind == "registration"
+    assert abs(worst.middle_mm[0] - scan.grid_points_mm[100, 120, 0]) < 6.0
+
+
+def test_strong_paint_that_knows_nothing_of_the_shape_raises_few_false_alarms():
+    found = compare(ball_scan(paint=0.5), scale_mm=2.5)
+    judged = np.isfinite(found.z).sum() * found.grid.spacing_mm**2
+    assert sum(region.area_mm2 for region in found.regions) < 0.01 * judged
+
+
+def test_a_scan_without_a_picture_or_without_distances_is_refused():
+    scan = ball_scan()
+    with pytest.raises(ScanError, match="no brightness"):
+        compare(replace(scan, brightness=None))
+    with pytest.raises(ScanError, match="no cell holds"):
+        compare(replace(scan, range_mm=np.full((SIZE, SIZE), np.nan, np.float32)))
