@@ -317,3 +317,13 @@ def test_diffuse_light_is_looked_up_where_interpolation_is_good_enough_and_says_
     full = tracer.render(camera, pose, Settings(passes=64, each=4, depth=4), seed=9)
     noise = full.standard_error() / full.mean_radiance
     assert difference(render(tracer, camera, pose, plan=plan), full) < math.hypot(0.02, noise)
+
+
+def test_two_pictures_tell_the_error_of_their_mean_and_keep_a_tight_promise_with_fewer_samples():
+    tracer = Tracer(scene("ball plaster dark"))
+    camera, pose = looking(24, 24, fov=26.0, eye=(0, 60, 290))
+    plan = make_plan(tracer, camera, pose, tolerance=0.006)
+    film = render(tracer, camera, pose, plan=plan, seed=3)
+    full = tracer.render(camera, pose, Settings(passes=128, each=16, depth=1, spike=False, lobe=False, diffuse=False), seed=11)
+    assert difference(film, full) < 0.006
+    assert film.samples.mean() < render_to(tracer, camera, pose, plan.settings, plan.error, seed=3).samples.mean()

@@ -69,7 +69,7 @@ def _refine(
     most: int,
 ) -> None:
     prior = np.empty(len(pixels), np.float32)
-    _unevenness(plate.mean, *plate.shape, prior)
+    unevenness(plate.mean, *plate.shape, prior)
     by_chance = settings.by_chance
     decay = _DECAY_OF_NOISE if by_chance else _DECAY_OF_EDGES
     least = _near_surfaces(plate.covered, plate.shape) * np.int32(2 if by_chance else 0)
@@ -131,7 +131,7 @@ def _allot(prior: FloatArray, spread: FloatArray, groups: IntArray, allowed: flo
 
 
 @stage_kernel
-def _unevenness(mean, height, width, prior):
+def unevenness(mean, height, width, prior):
     """Squared error that a pixel's single sample may have: a quarter of its largest squared second difference, mean over channels."""
     channels = mean.shape[1]
     for row in range(height):

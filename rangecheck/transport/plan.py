@@ -23,6 +23,7 @@ from rangecheck.transport.adaptive import render_to
 from rangecheck.transport.camera_rays import PictureRays, pixel_order
 from rangecheck.transport.even import render_evenly, with_lobe_forms
 from rangecheck.transport.film import Film
+from rangecheck.transport.halves import render_in_halves
 from rangecheck.transport.settings import REPORT, Settings
 from rangecheck.transport.tracer import Tracer
 
@@ -41,6 +42,8 @@ _PILOT_PIXELS, _PILOT_PASSES = 2048, 8
 _FORM_WORTH_A_TRY = 0.1
 _DEPTHS = (1, 2, 3, 4, 6, 10, 16)
 _FULL_DEPTH = 64
+#: an error below this is measured by two pictures, where chance has a part; above, the least number of samples is the price
+_MEASURED_BELOW = 0.006
 
 
 @dataclass(frozen=True)
@@ -113,6 +116,8 @@ def render(
         film = work.render(camera, world_from_camera, plan.settings, seed=seed)
     elif plan.model == "full":
         film = render_evenly(work, camera, world_from_camera, plan.settings, plan.error, seed=seed)
+    elif plan.error < _MEASURED_BELOW and (plan.settings.by_chance or plan.settings.shadow_rays):
+        film = render_in_halves(work, camera, world_from_camera, plan.settings, plan.error, seed=seed)
     else:
         film = render_to(work, camera, world_from_camera, plan.settings, plan.error, seed=seed)
     return film.in_channels(tracer.scene.channels) if plan.grey else film
