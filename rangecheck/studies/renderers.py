@@ -42,6 +42,8 @@ ROUGH_STEEL = Material("rough steel", K_s=0.6, sigma_um=2.0, correlation_um=20.0
 ONE_MORE = Settings(centre=True, shadow_rays=0, diffuse=False, depth=2, backdrop=False)
 #: the error that both renderers are timed to
 GOAL = 0.01
+#: samples a pixel up to which the outside renderer is followed; beyond, its independent samples obey the inverse square root
+_MOST_OUTSIDE = 256
 #: degrees that the race's pictures span, which the bust fills; points of its scan, whose faces are then about as large as pixels
 _FIELD_DEG, _POINTS = 22.0, (320, 384)
 #: samples in one call of the outside renderer; more need gigabytes
@@ -140,7 +142,7 @@ def _outside_racers(scene: Scene, size: int, depth: int, halves: int, variants: 
 
         if reference is None:
             reference = (picture(halves, 50_000), picture(halves, 60_000))
-        racers.append(Racer(f"mitsuba {variant} {sampler}", picture, 4, 2.0, 2048, reference, ready, "samples a pixel"))
+        racers.append(Racer(f"mitsuba {variant} {sampler}", picture, 4, 2.0, _MOST_OUTSIDE, reference, ready, "samples a pixel"))
     return racers
 
 
@@ -185,11 +187,13 @@ def _race(name: str, scene: Scene, settings: Settings, wanted: float, quick: boo
     ours, where = _our_racers(scene, size, settings, halves)
     variants = [("scalar_rgb", "independent")] if quick else outside_variants()
     racers = [*ours, *_outside_racers(scene, size, settings.depth, halves, variants)]
-    table, efforts = [], []
+    table, efforts, beyond = [], [], []
     for racer in racers:
         rows, effort = run_to(racer, where, goal)
         table += rows
-        efforts.append(effort)
+        independent = racer not in ours and not np.isfinite(effort)
+        beyond.append((rows[-1]["error"] / goal) ** 2 if independent else 1.0)
+        efforts.append(rows[-1]["effort"] if independent else effort)
     runs: list[list[float]] = [[] for _ in racers]
     for repeat in range(1 if quick else 3):
         for index, racer in enumerate(racers):
@@ -197,13 +201,14 @@ def _race(name: str, scene: Scene, settings: Settings, wanted: float, quick: boo
                 begin = time.perf_counter()
                 racer.picture(efforts[index], repeat)
                 runs[index].append(time.perf_counter() - begin)
-    seconds = [statistics.median(t) if t else float("nan") for t in runs]
+    seconds = [more * statistics.median(t) if t else float("nan") for t, more in zip(runs, beyond)]
     said = [
-        f"{name}, {size}x{size}: {racer.name} reaches {100 * goal:g} % in {t:.3g} s at {effort:.3g} {racer.unit}; "
+        f"{name}, {size}x{size}: {racer.name} reaches {100 * goal:g} % in {t:.3g} s at {effort * more:.4g} {racer.unit}"
+        f"{f' (extrapolated from {effort:g})' if more > 1 else ''}; "
         f"made ready, first picture included, in {racer.ready_s:.2g} s"
         if np.isfinite(t)
         else f"{name}, {size}x{size}: {racer.name} does not reach {100 * goal:g} % by {racer.last:g} {racer.unit}"
-        for racer, t, effort in zip(racers, seconds, efforts)
+        for racer, t, effort, more in zip(racers, seconds, efforts, beyond)
     ]
     best = [
         min((t for t in times if np.isfinite(t)), default=float("nan")) for times in (seconds[: len(ours)], seconds[len(ours) :])
