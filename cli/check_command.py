@@ -18,5 +18,7 @@ def command(files, opinions, printer, profile, register, filters, unit, config, 
     """
     from rangecheck.pipeline import check
 
-    settings = settings_from(config, assignments, scan__registration=register, scan__filters=filters or None, scan__profile=profile)
+    settings = settings_from(
+        config, assignments, scan__registration=register, scan__filters=filters or None, scan__profile=profile
+    )
     return check(files, settings=settings, unit=unit, opinions=opinions, printer=printer, reporter=reporter)

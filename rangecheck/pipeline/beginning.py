@@ -22,6 +22,7 @@ from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.subject import read_all_scans
 from rangecheck.progress import Reporter
 from rangecheck.reflectance import load_material
+from rangecheck.scan.point_cloud import PointCloud
 
 #: bytes that a job leaves: of a face in the STL and the surface (their faces are at most three a distance), of a pixel of a frame
 #: with its film, of a pixel of the maps at one focal point
@@ -96,9 +97,7 @@ def rehearse(scans: Sequence[str], out: str, *, settings: Settings, unit: str | 
     encoder = find_encoder(".mp4")
     materials = [load_material(name) for name in settings.light.materials]
     measured = read_all_scans(scans, unit, reporter)
-    from rangecheck.scan import RangeScan
-
-    distances = sum(int(one.valid.sum()) if isinstance(one, RangeScan) else len(one.points_mm()) for one in measured)
+    distances = sum(len(one.points_mm) if isinstance(one, PointCloud) else int(one.valid.sum()) for one in measured)
     pixels = settings.picture.width * settings.picture.height
     needed = int(
         distances * FACES_A_DISTANCE * BYTES_A_FACE

@@ -232,7 +232,18 @@ def load_material(name_or_path: str | Path) -> Material:
 
 
 _NUMBERS = ("K_lm", "K_ss", "K_sl", "K_s")
-_KEYS = (*_NUMBERS, "sigma_um", "correlation_um", "wavelengths_um", "masking", "bounded", "description", "source", "index", "uncertainty")
+_KEYS = (
+    *_NUMBERS,
+    "sigma_um",
+    "correlation_um",
+    "wavelengths_um",
+    "masking",
+    "bounded",
+    "description",
+    "source",
+    "index",
+    "uncertainty",
+)
 _INDEX_KEYS = ("wavelengths_um", "n", "k", "source")
 
 

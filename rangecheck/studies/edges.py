@@ -21,6 +21,7 @@ from rangecheck.reflectance import GREY_UM, load_material
 from rangecheck.scene import Scene, Source
 from rangecheck.studies.scenes import RADIUS_MM, ball, bust_relief, floor, view
 from rangecheck.study import EdgeChart, Line, LineChart, Part, find_edge
+from rangecheck.study.result import Chart
 from rangecheck.surface import Surface
 from rangecheck.surface.surface import join
 from rangecheck.transport import Settings, Tracer
@@ -102,7 +103,7 @@ def highlights_part(quick: bool) -> Part:
             f"steel's highlights on the {name} ({made.pieces_still} without noise): half their light is astray from "
             f"{edge.breaks_at or math.nan:.3g} degrees of facet noise; twice as many pieces at {doubled or math.nan:.3g} degrees (step of the sweep)"
         )
-    charts = [
+    charts: list[Chart] = [
         EdgeChart(
             "highlights", "Where steel's highlights break up", "facet noise, degrees (root mean square)",
             "share of the highlights' light outside their place", edges, log="x",

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -47,7 +48,9 @@ def _gathering(quick: bool) -> Part:
         passes = converged // 64
         truth = tracer.render(camera, pose, replace(base, passes=passes, lobe_rays=64, gather="order"), seed=91)
         lines = []
-        methods = [(f"rings {step:g}° apart", {"gather": "fan", "fan_step_deg": step}, range(1, 17)) for step in (5.0, 2.0, 1.0)]
+        methods: list[tuple[str, dict[str, Any], Sequence[int]]] = [
+            (f"rings {step:g}° apart", {"gather": "fan", "fan_step_deg": step}, range(1, 17)) for step in (5.0, 2.0, 1.0)
+        ]
         methods.append(("drawn by scattering order", {"gather": "order"}, [4**k for k in range(6)]))
         for method, settings, counts in methods:
             xs, ys = [], []
@@ -57,7 +60,7 @@ def _gathering(quick: bool) -> Part:
                 if rays > most or reach > 45.0 or count not in (1, 2, 3, 4, 6, 8, 12, 16, 64, 256):
                     continue
                 begin = time.perf_counter()
-                film = tracer.render(camera, pose, replace(base, lobe_rays=count, **settings), seed=5)  # type: ignore[arg-type]
+                film = tracer.render(camera, pose, replace(base, lobe_rays=count, **settings), seed=5)
                 seconds = time.perf_counter() - begin
                 xs.append(float(rays))
                 ys.append(_relative(film, truth))
