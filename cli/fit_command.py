@@ -20,6 +20,12 @@ from .common import Point, common, settings_from
 )
 @click.option("--noise", type=click.FloatRange(1e-6, 1), default=0.01, help="Standard deviation of a pixel, parts of full scale.")
 @click.option(
+    "--scale",
+    type=click.FloatRange(0, min_open=True),
+    metavar="MM",
+    help="Length over which a scan is held against its brightness.",
+)
+@click.option(
     "--irradiance", type=click.FloatRange(1e-9), default=3.0, help="Of the lamps, so that a white surface shows irradiance/pi."
 )
 @click.option("--spike", is_flag=True, help="Also fit a mirror's share; its highlight must be seen.")

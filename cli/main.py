@@ -18,7 +18,7 @@ COMMANDS = {
     "run": "Do the whole job: mesh, check, close, render, measure, export STL, report.",
     "check": "Check range scans or mesh files; verdict, findings with places, numbers.",
     "mesh": "Turn scans into one surface and say by which method and why.",
-    "solid": "Close, repair and base a mesh so that it can be built; export STL.",
+    "solid": "Close, repair, base, hollow and simplify a mesh so that it can be built; export it.",
     "render": "Make one picture of a mesh, scan or scene.",
     "maps": "Distance, depth, normals and surface IDs from any focal point.",
     "turntable": "Frames and video of an orbit; resumes where it was stopped.",

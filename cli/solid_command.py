@@ -72,7 +72,9 @@ class Simplify(click.ParamType):
 @click.option("--force-open", is_flag=True, help="Write it even if it is no solid.")
 @common("out_file", "unit", "config", "set", "force")
 def command(mesh, out, unit, config, assignments, force, orient, ascii, force_open, reporter, **wanted):
-    """Close, repair, base, hollow and simplify a mesh so that it can be built; export STL, 3MF, PLY, GLB, OBJ or OFF by the ending.
+    """Close, repair, base, hollow and simplify a mesh so that it can be built; export it.
+
+    The ending of FILE says as what: STL, 3MF, PLY, GLB, OBJ or OFF.
 
     The file is read back as a slicer would read it, and checked again; what is not solid is not written. FILE.json beside it says what it
     was made of, and how.

@@ -29,7 +29,7 @@ from rangecheck.pipeline.page import contours_of, keep_for_report, page_of
 from rangecheck.pipeline.preparing import prepared
 from rangecheck.pipeline.scanning import refused
 from rangecheck.pipeline.shape import findings_lines, solid_of
-from rangecheck.pipeline.subject import eye_of, hashes, read_all_scans, surface_of
+from rangecheck.pipeline.subject import Subject, eye_of, hashes, read_all_scans, surface_of
 from rangecheck.pipeline.turning import Rendered, render_turntable
 from rangecheck.pipeline.views import map_at, orbit_of
 from rangecheck.progress import Reporter
@@ -65,13 +65,14 @@ def run(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None,
         front = _front_deg(shown, eye_of(ready.scans), reporter)
         turn = settings.turntable.model_copy(update={"start_deg": settings.turntable.start_deg + front})
         orbit = orbit_of(shown, settings.model_copy(update={"turntable": turn}))
+        subject = Subject("bust", shown, front_deg=front)
         turntables = [
             render_turntable(
-                shown, name, orbit, folder / f"{name}.mp4", folder / "frames" / name, settings, reporter, force=force
+                subject, name, orbit, folder / f"{name}.mp4", folder / "frames" / name, settings, reporter, force=force
             )
             for name in settings.light.materials
         ]
-        turntables += _stripes(shown, orbit, folder, settings, reporter, force=force)
+        turntables += _stripes(subject, orbit, folder, settings, reporter, force=force)
         consistency = _consistency(shown, ready.grids, orbit, turntables, folder, settings, reporter)
         with reporter.stage("contours"):
             for scan in read:
@@ -164,7 +165,7 @@ def _front_deg(shown: Surface, eye_mm: FloatArray | None, reporter: Reporter) ->
 
 
 def _stripes(
-    shown: Surface, orbit: Orbit, folder: Path, settings: Settings, reporter: Reporter, *, force: bool
+    subject: Subject, orbit: Orbit, folder: Path, settings: Settings, reporter: Reporter, *, force: bool
 ) -> list[Rendered]:
     """Where a material of the pictures mirrors, also what it makes of bands of light: they bend where its slope does."""
     mirror = next((name for name in settings.light.materials if load_material(name).strengths()[1:].any()), None)
@@ -172,7 +173,7 @@ def _stripes(
         return []
     striped = settings.model_copy(update={"turntable": settings.turntable.model_copy(update={"show": "stripes"})})
     frames = folder / "frames" / "stripes"
-    made = render_turntable(shown, mirror, orbit, folder / "stripes.mp4", frames, striped, reporter, force=force)
+    made = render_turntable(subject, mirror, orbit, folder / "stripes.mp4", frames, striped, reporter, force=force)
     return [replace(made, material="stripes")]
 
 

@@ -25,15 +25,15 @@ from rangecheck.surface.distance import SurfaceDistance
 MOST_FACES = 220_000
 #: the first tolerance, as a share of the extent
 _FIRST = 1 / 3600
-#: samples of the scans that are compared with the surface
-_MOST_SAMPLES = 300_000
+#: samples of the scans, and vertices of the real surface, that are compared
+_MOST_SAMPLES, _MOST_LOOKED_AT = 150_000, 100_000
 #: directions of the coverage sphere: rows of elevation, columns of azimuth
 COVERAGE_SHAPE = (36, 72)
 
 
 @dataclass(frozen=True, eq=False)
 class Likeness:
-    """surface: what is shown; off_mm: farthest that any vertex of the real one lies from it, off_99_mm: 99 % of them lie nearer;
+    """surface: what is shown; off_mm: farthest that any of the real one's vertices that were looked at lies from it, off_99_mm: 99 % of them lie nearer;
     faces: of the real one. On its vertices, NaN where there is none: error_mm expected, deviation_mm of the scans' samples from the real
     surface (positive outside), thickness_mm of the wall; flagged: 0, or 1 + the worst severity of a finding there."""
 
@@ -55,7 +55,8 @@ def likeness(
     With same_place False, `shown` was scaled or moved since, and nothing measured is carried over."""
     light = lighter(shown)
     real, here = SurfaceDistance(shown), SurfaceDistance(light)
-    away = here.distance_mm(shown.vertices)[0] if len(shown.vertices) else np.zeros(1)
+    looked_at = shown.vertices[:: max(1, len(shown.vertices) // _MOST_LOOKED_AT)]
+    away = here.distance_mm(looked_at)[0] if len(looked_at) else np.zeros(1)
     nothing = np.full(len(light.vertices), np.nan)
     flagged = np.zeros(len(light.vertices), np.uint8)
     if found is not None:
@@ -96,16 +97,19 @@ def lighter(surface: Surface) -> Surface:
 
 def _errors(light: Surface, meshed: Surface) -> FloatArray:
     """Expected error of the nearest vertex as meshed; none where the surface was invented or cut."""
+    from scipy.spatial import cKDTree
+
     values = np.full(len(light.vertices), np.nan)
-    if meshed.vertex_error_mm is None:
+    if meshed.vertex_error_mm is None or not len(meshed.faces):
         return values
-    near = SurfaceDistance(meshed).nearest(light.vertices)
-    corners = meshed.faces[near.face]
-    corner = np.linalg.norm(meshed.vertices[corners] - near.place_mm[:, None], axis=2).argmin(axis=1)
-    taken = meshed.vertex_error_mm[corners[np.arange(len(corners)), corner]]
-    longest = np.linalg.norm(np.ptp(meshed.triangles[near.face], axis=1), axis=1)
-    known = (near.distance_mm <= longest) & (meshed.origin_of_face[near.face] != INVENTED)
-    values[known] = taken[known]
+    longest, trusted = np.zeros(len(meshed.vertices)), np.zeros(len(meshed.vertices), bool)
+    trusted[meshed.faces[meshed.origin_of_face != INVENTED]] = True
+    for corner in range(3):
+        edge = meshed.triangles[:, corner] - meshed.triangles[:, corner - 1]
+        np.maximum.at(longest, meshed.faces[:, corner], np.sqrt(np.einsum("ij,ij->i", edge, edge)))
+    away, vertex = cKDTree(meshed.vertices).query(light.vertices)
+    known = trusted[vertex] & (away <= longest[vertex])
+    values[known] = meshed.vertex_error_mm[vertex[known]]
     return values
 
 

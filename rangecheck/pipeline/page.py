@@ -285,7 +285,7 @@ def _model(kept: dict[str, Any]) -> Model:
     if int(kept["faces_before"]) != len(surface.faces):
         about = (
             f"{about} of the bust's {int(kept['faces_before']):,}: 99 % of its points lie within {off_99:.2f} mm of this likeness, "
-            f"all within {off:.2f} mm"
+            f"the farthest that was looked at {off:.2f} mm"
         )
     fields = []
     for key, label, colours in (

@@ -28,8 +28,10 @@ def scene_of(subject: Subject, material: Material, *, direct: bool = False, stri
     """A modelled scene as its file says; any other surface in the studio that suits its material: soft boxes for what mirrors,
     lamps for what does not - lamps alone where only their `direct` light is followed. Or any surface among inspection `stripes`."""
     surface, model = subject.surface, subject.model
+    azimuth = np.radians(subject.front_deg)
+    front = (float(np.sin(azimuth)), 0.0, float(np.cos(azimuth)))
     if stripes:
-        return studio(surface, material, "stripes", smooth=True)
+        return studio(surface, material, "stripes", smooth=True, front=front)
     if model is not None and model.lamps:
         names = list(dict.fromkeys(name or material.name for name in model.material_of_part))
         return Scene(
@@ -43,7 +45,7 @@ def scene_of(subject: Subject, material: Material, *, direct: bool = False, stri
         )
     strengths = material.strengths().mean(axis=1)
     matt = strengths[0] > strengths[1:].sum()
-    return studio(surface, material, ("dark" if direct else "plaster") if matt else "steel", smooth=True)
+    return studio(surface, material, ("dark" if direct else "plaster") if matt else "steel", smooth=True, front=front)
 
 
 def plan_of(tracer: Tracer, camera: PinholeCamera, pose: FloatArray, settings: Settings) -> Plan:

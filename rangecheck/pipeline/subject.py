@@ -27,13 +27,14 @@ MESH_SUFFIXES = (".stl", ".obj", ".off", ".glb", ".3mf", ".ply")
 
 @dataclass(frozen=True)
 class Subject:
-    """A surface, and the scans it was made of where it was."""
+    """A surface, and the scans it was made of where it was. `front_deg` is the azimuth of its front, about y from +z towards +x."""
 
     name: str
     surface: Surface
     scans: list[RangeScan] = field(default_factory=list)
     method: str = "read"
     model: Model | None = None
+    front_deg: float = 0.0
 
 
 def holds_capture(path: Path) -> bool:
