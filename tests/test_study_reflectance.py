@@ -39,5 +39,5 @@ def test_the_published_model_makes_light_past_about_75_degrees():
 
 def test_a_study_is_found_by_name():
     assert all(callable(study_named(name)) for name in STUDIES)
-    with pytest.raises(SettingError, match="there is no study 'alchemy'; choose one of .*reflectance"):
+    with pytest.raises(SettingError, match=r"there is no study 'alchemy'; choose one of .*reflectance"):
         study_named("alchemy")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import resource
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -73,6 +74,12 @@ def run(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None,
             for name in settings.light.materials
         ]
         turntables += _stripes(subject, orbit, folder, settings, reporter, force=force)
+        # what the report needs of the surface leaves a core idle, as do the stages until then
+        aside = ThreadPoolExecutor(1)
+        kept = aside.submit(
+            keep_for_report, folder, shown, surface, read, judged if made is not None else None, settings, front_deg=front
+        )
+        aside.shutdown(wait=False)
         consistency = _consistency(shown, ready.grids, orbit, turntables, folder, settings, reporter)
         with reporter.stage("contours"):
             for scan in read:
@@ -104,7 +111,7 @@ def run(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None,
             peak_memory_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         )  # fmt: skip
         with reporter.stage("report"):
-            keep_for_report(folder, shown, surface, read, judged if made is not None else None, settings, front_deg=front)
+            kept.result()
             write_report(page_of(folder, content), folder / "report.html")
         content["seconds"] = dict(reporter.seconds)
         write_json(folder / FINISHED, content)

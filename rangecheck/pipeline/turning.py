@@ -230,6 +230,10 @@ def _frames(
         with reporter.stage(f"planning light, {material.name}"):
             tracer = Tracer(scene)
             plan = plan_of(tracer, optics.camera, orbit.world_from_camera(0), settings)
+            if show == "stripes" and not plan.grey:
+                plan = dataclasses.replace(
+                    plan, grey=True, reasons=(*plan.reasons, "one wavelength: stripes show slope, not colour")
+                )
             said = [*plan.explain(), *said]
             if optics.lens is not None:
                 said.append(

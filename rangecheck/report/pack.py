@@ -33,7 +33,7 @@ def packed(array: IntArray) -> dict[str, Any]:
     change = np.diff(rows, axis=0, prepend=np.zeros((1, rows.shape[1]), rows.dtype)).view(_SIGNED[width])
     folded = ((change << 1) ^ (change >> (8 * width - 1))).view(_UNSIGNED[width]).T.copy()
     planes = folded.reshape(-1, 1).view(np.uint8).T if folded.size else np.empty((width, 0), np.uint8)
-    text = base64.b64encode(zlib.compress(np.ascontiguousarray(planes).tobytes(), 9)).decode()
+    text = base64.b64encode(zlib.compress(np.ascontiguousarray(planes).tobytes(), 6)).decode()
     return {"bytes": width, "columns": rows.shape[1], "count": len(rows), "data": text}
 
 
