@@ -41,6 +41,8 @@ from rangecheck.solid import Finding, Verdict, finding, verdict
 from rangecheck.surface import INVENTED, ORIGIN_NAMES, Surface
 
 FINISHED = "run.json"
+#: the job's stripes are looked at view by view: a third of the turntable's frames, but not fewer than these
+LEAST_STRIPES = 8
 
 
 def run(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None, force: bool, reporter: Reporter) -> Outcome:
@@ -178,9 +180,11 @@ def _stripes(
     mirror = next((name for name in settings.light.materials if load_material(name).strengths()[1:].any()), None)
     if mirror is None or settings.turntable.show != "picture":
         return []
-    striped = settings.model_copy(update={"turntable": settings.turntable.model_copy(update={"show": "stripes"})})
+    turn = settings.turntable.model_copy(update={"show": "stripes", "fps": max(1, settings.turntable.fps // 3)})
+    striped = settings.model_copy(update={"turntable": turn})
     frames = folder / "frames" / "stripes"
-    made = render_turntable(subject, mirror, orbit, folder / "stripes.mp4", frames, striped, reporter, force=force)
+    fewer = replace(orbit, frames=max(min(orbit.frames, LEAST_STRIPES), orbit.frames // 3))
+    made = render_turntable(subject, mirror, fewer, folder / "stripes.mp4", frames, striped, reporter, force=force)
     return [replace(made, material="stripes")]
 
 
