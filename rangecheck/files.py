@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -15,6 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from rangecheck.errors import InputError, OutputError
+
+#: the names under which `whole_file` writes
+_PART = re.compile(r"\..+\.[a-z0-9_]{8}\.part(\.[^.]+)?")
 
 
 @contextmanager
@@ -45,6 +49,13 @@ def whole_file(path: str | Path, *, force: bool = True) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             part.unlink(missing_ok=True)
+
+
+def sweep_parts(folder: str | Path) -> None:
+    """Remove what `whole_file` left below `folder` when its process was killed; call it only where nobody else writes."""
+    for path in Path(folder).rglob(".*.part*"):
+        if _PART.fullmatch(path.name) and path.is_file():
+            path.unlink(missing_ok=True)
 
 
 def _umask() -> int:

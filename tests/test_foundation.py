@@ -153,3 +153,18 @@ def test_where_no_cache_can_be_written_kernels_compile_all_the_same(monkeypatch)
     twice = kernels.kernel(lambda x: 2 * x)
     assert twice(21) == 42 and twice(2) == 4
     assert told == ["compiling"]
+
+
+def test_parts_that_a_killed_process_left_are_swept_up_and_nothing_else(tmp_path):
+    below = tmp_path / "frames"
+    below.mkdir()
+    kept = [tmp_path / "a.part.png", tmp_path / ".hidden.partial", below / "b.png", below / ".lock"]
+    for path in kept:
+        path.write_text("kept")
+    with files.whole_file(below / "c.png") as part:
+        survivor = part.with_name(".d.abcdefgh.part.png")
+        survivor.write_text("half")
+        part.write_text("whole")
+    files.sweep_parts(tmp_path)
+    assert not survivor.exists()
+    assert all(path.exists() for path in [*kept, below / "c.png"])

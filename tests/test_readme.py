@@ -6,6 +6,8 @@ from pathlib import Path
 
 from rangecheck_cli.main import exit_status
 
+from rangecheck.studies import STUDIES
+
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text()
 
@@ -22,6 +24,20 @@ def test_every_command_in_readme_works(tmp_path, monkeypatch):
         assert program == "rangecheck"
         # a small job's verdict may be that it is not fit; what must not happen is that a command fails
         assert exit_status([*arguments, "-q"]) in ((0, 1) if arguments[0] in ("run", "check") else (0,)), command
+
+
+def test_every_python_block_in_readme_works(tmp_path, monkeypatch):
+    (tmp_path / "sample_data").symlink_to(ROOT / "sample_data")
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"^```python\n(.*?)^```", README, re.S | re.M)
+    assert blocks
+    for block in blocks:
+        exec(compile(block, "README.md", "exec"), {})
+
+
+def test_every_study_of_the_table_exists():
+    rows = re.findall(r"^\| ((?:`[a-z]+`(?:, )?)+) \|", README.split("rangecheck study ... -o DIR")[1].split("##")[0], re.M)
+    assert {name for row in rows for name in re.findall(r"`([a-z]+)`", row)} == {*STUDIES, "job"}
 
 
 def test_every_picture_in_readme_exists():

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from rangecheck.errors import InputError, OutputError
-from rangecheck.files import read_json, write_json
+from rangecheck.files import read_json, sweep_parts, write_json
 
 UNFINISHED = "unfinished.json"
 
@@ -62,6 +62,7 @@ def job_folder(path: str | Path, key: str, finished: str, *, force: bool) -> Ite
     except OSError as error:
         raise OutputError(path, f"cannot be made ({error.strerror})") from None
     with _lock(path):
+        sweep_parts(path)
         write_json(path / UNFINISHED, {"schema": "rangecheck/unfinished/1", "key": key})
         (path / finished).unlink(missing_ok=True)
         yield path
