@@ -57,7 +57,8 @@ def run(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None,
         return refused("run", refusal, reporter)
     read = ready.grids
     key = key_of(inputs=inputs, unit=unit, settings=settings.model_dump(mode="json"), versions=versions())
-    with job_folder(out, key, FINISHED, force=force) as folder:
+    # the pool ends before the folder is given free, however the job ends
+    with job_folder(out, key, FINISHED, force=force) as folder, ThreadPoolExecutor(1) as aside:
         write_json(folder / "settings.json", document("settings", **settings.model_dump(mode="json")))
         surface, method, reason = surface_of(ready.scans, settings, reporter)
         made, judged = solid_of(surface, settings, reporter, eye_of(ready.scans))
@@ -77,11 +78,9 @@ def run(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None,
         ]
         turntables += _stripes(subject, orbit, folder, settings, reporter, force=force)
         # what the report needs of the surface leaves a core idle, as do the stages until then
-        aside = ThreadPoolExecutor(1)
         kept = aside.submit(
             keep_for_report, folder, shown, surface, read, judged if made is not None else None, settings, front_deg=front
         )
-        aside.shutdown(wait=False)
         consistency = _consistency(shown, ready.grids, orbit, turntables, folder, settings, reporter)
         with reporter.stage("contours"):
             for scan in read:
