@@ -15,7 +15,8 @@ import numpy as np
 from rangecheck.arrays import BoolArray, FloatArray
 from rangecheck.kernels import stage_kernel
 from rangecheck.reflectance import Material, stack_tables
-from rangecheck.reflectance.sampling import lobe_density, scattered_direction, scattering_order
+from rangecheck.reflectance.lobe import smith_masking
+from rangecheck.reflectance.sampling import lobe_density, normal_quantile, scattered_direction, scattering_order
 from rangecheck.reflectance.tables import (
     CORRELATION_UM,
     K_LM,
@@ -32,8 +33,8 @@ from rangecheck.transport.chance import LOBE_WAY, ORDER, key_of, point
 
 #: roughness g at normal incidence above which a lobe is also drawn from its slopes
 _SEVERAL_ORDERS = 4.0
-#: probability with which the order is that of light from the zenith
-_STEEP_SHARE = 0.2
+#: the most of the draws that are made from slopes, and how many more of the rest take the order of light from the zenith
+_MOST_SLOPES, _STEEP_SHARE = 0.9, 0.2
 
 
 class Materials(NamedTuple):
@@ -89,9 +90,9 @@ def diffuse_of(materials, material, wave):
 
 @stage_kernel
 def _slope_share(materials, material):
-    """With which probability a lobe is drawn from its slopes instead of by scattering order."""
+    """With which probability a lobe is drawn from its slopes instead of by scattering order: the more, the nearer to the rough limit."""
     roughness = 4.0 * materials.surfaces[material, materials.wave, ROUGHNESS]
-    return 0.4 if roughness > _SEVERAL_ORDERS else 0.0
+    return _MOST_SLOPES * roughness / (roughness + _SEVERAL_ORDERS) if roughness > _SEVERAL_ORDERS else 0.0
 
 
 @stage_kernel
@@ -102,18 +103,50 @@ def _slopes(materials, material):
 
 
 @stage_kernel
-def _slope_density(alpha, cos_i, cos_r, toward):
-    """Density per steradian of directions mirrored by facets of Trowbridge and Reitz's slopes, as many as are seen from cos_r."""
+def seen_slope(tangent, u):
+    """The slope towards a viewer, of width 1, below which a share u of the facets lies that are seen from an angle of this tangent:
+    density (1 + t tangent) e^-t^2 for t > -1/tangent (Heitz & d'Eon 2014), inverted by Newton's method inside a bracket."""
+    normal = normal_quantile(min(max(u, 1e-12), 1.0 - 1e-12)) * math.sqrt(0.5)
+    if tangent < 1e-5:
+        return normal
+    low, high = max(-1.0 / tangent, -5.5), 5.5
+    root = tangent / math.sqrt(math.pi)
+    below = math.erf(low) - root * math.exp(-low * low)
+    total = 1.0 - below
+    steep = tangent / (1.0 + tangent)
+    # from all facets alike to only those that grow with their slope
+    t = (1.0 - steep) * normal + steep * math.sqrt(-math.log1p(-min(max(u, 1e-12), 1.0 - 1e-12)))
+    t = min(max(t, low), high)
+    for _ in range(24):
+        fall = math.exp(-t * t)
+        over = math.erf(t) - root * fall - below - u * total
+        if over > 0.0:
+            high = t
+        else:
+            low = t
+        rise = 2.0 / math.sqrt(math.pi) * (1.0 + t * tangent) * fall
+        step = over / rise if rise > 0.0 else 2.0 * (high - low)
+        after = t - step
+        if not low < after < high:
+            after = 0.5 * (low + high)
+        moved, t = abs(after - t), after
+        if moved < 1e-7:
+            break
+    return t
+
+
+@stage_kernel
+def slope_density(alpha, cos_i, cos_r, toward):
+    """Density per steradian of directions mirrored by facets of Gaussian slopes, as many as are seen from cos_r: D G1/(4 cos_r)."""
     height2 = 2.0 * (1.0 + toward)
     both = cos_i + cos_r
-    if not height2 > 0.0:
+    if not (height2 > 0.0 and both > 0.0):
         return 0.0
     cos2 = min(1.0, both * both / height2)
-    spread = alpha * alpha * cos2 + 1.0 - cos2
-    sine2 = max(0.0, 1.0 - cos_r * cos_r)
-    # G1/(4 cos_r), without the cosine in its denominator
-    seen = 1.0 / (2.0 * (cos_r + math.sqrt(cos_r * cos_r + alpha * alpha * sine2)))
-    return seen * alpha * alpha / (math.pi * spread * spread)
+    alpha2 = alpha * alpha
+    # the cosine in the denominator is the viewer's, which masking takes along to 0
+    seen = smith_masking(max(cos_r, 1e-9), alpha) / max(cos_r, 1e-9)
+    return seen * math.exp((1.0 - 1.0 / cos2) / alpha2) / (4.0 * math.pi * alpha2 * cos2 * cos2)
 
 
 @stage_kernel
@@ -122,28 +155,23 @@ def draw_lobe(materials, material, cosine, key, number):
 
     By scattering order, as `reflectance.sampling` has it. But seen at grazing angles a surface scatters upwards far more often than its
     order at the mirror angle says: so some directions are drawn with the order that light from the zenith would have, and on surfaces
-    of several orders some are mirrored by visible facets (Dupuy & Benyoub, *Sampling visible GGX normals with spherical caps*, 2023).
-    The density is that of all together (Veach & Guibas 1995), so that no weight grows large."""
+    of several orders most are mirrored by visible facets (Heitz & d'Eon, *Importance sampling microfacet-based BSDFs using the
+    distribution of visible normals*, 2014), whose weight is the masking of the direction that is drawn. The density is that of all together (Veach & Guibas 1995), so that no weight grows large."""
     row = materials.surfaces[material, materials.wave]
     luck, which = point(key_of(key, ORDER), number)
     p, q = point(key_of(key, LOBE_WAY), number)
     sine = math.sqrt(max(0.0, 1.0 - cosine * cosine))
     share = _slope_share(materials, material)
+    steeply = _STEEP_SHARE * (1.0 - share * share)
     if which < share:
         alpha = _slopes(materials, material)
-        size = math.sqrt(alpha * alpha * sine * sine + cosine * cosine)
-        vx, vz = alpha * sine / size, cosine / size
-        up = (1.0 - q) * (1.0 + vz) - vz
-        aside = math.sqrt(max(0.0, 1.0 - up * up))
-        hx, hy, hz = alpha * (aside * math.cos(2.0 * math.pi * p) + vx), alpha * aside * math.sin(2.0 * math.pi * p), up + vz
-        size = math.sqrt(hx * hx + hy * hy + hz * hz)
-        if not size > 0.0:
-            return 0.0, 0.0, 0.0, 1.0
-        hx, hy, hz = hx / size, hy / size, hz / size
-        twice = 2.0 * (sine * hx + cosine * hz)
-        x, y, z = twice * hx - sine, twice * hy, twice * hz - cosine
+        turned = alpha * normal_quantile(min(max(q, 1e-12), 1.0 - 1e-12)) * math.sqrt(0.5)
+        lean = alpha * seen_slope(alpha * sine / max(cosine, 1e-9), p)
+        size = math.sqrt(lean * lean + turned * turned + 1.0)
+        twice = 2.0 * (sine * lean + cosine) / (size * size)
+        x, y, z = twice * lean - sine, twice * turned, twice - cosine
     else:
-        cosines = 1.0 + cosine if which < share + _STEEP_SHARE else 2.0 * cosine
+        cosines = 1.0 + cosine if which < share + steeply else 2.0 * cosine
         order = scattering_order(row[ROUGHNESS] * cosines * cosines, luck, 1)
         x, y, z = scattered_direction(order, row[REACH], cosine, p, q)
     if not z > 0.0:
@@ -152,7 +180,7 @@ def draw_lobe(materials, material, cosine, key, number):
     aside = dx * dx + y * y
     flat = lobe_density(materials.surfaces, materials.series, material, materials.wave, cosine, z, aside)
     steep = lobe_density(materials.surfaces, materials.series, material, materials.wave, 0.5 * (1.0 + cosine), z, aside)
-    density = (1.0 - share - _STEEP_SHARE) * flat + _STEEP_SHARE * steep
+    density = (1.0 - share - steeply) * flat + steeply * steep
     if share > 0.0:
-        density += share * _slope_density(_slopes(materials, material), z, cosine, sine * x + cosine * z)
+        density += share * slope_density(_slopes(materials, material), z, cosine, sine * x + cosine * z)
     return x, y, z, density
