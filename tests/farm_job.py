@@ -2,6 +2,7 @@
 
 import os
 import signal
+import time
 from pathlib import Path
 
 import numpy as np
@@ -18,3 +19,13 @@ def noisy_frames(job):
         return np.random.default_rng([job["seed"], index]).uniform(0.1, 1.0, (16, 16))
 
     return frame
+
+
+def slow_numbers(job):
+    """Each number times job["times"], a tenth of a second later."""
+
+    def number(index):
+        time.sleep(0.1)
+        return index * job["times"]
+
+    return number

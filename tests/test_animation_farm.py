@@ -1,5 +1,7 @@
 """Frames made on a cluster are the frames made at home, even when a worker dies."""
 
+import os
+import signal
 import warnings
 
 import pytest
@@ -61,6 +63,21 @@ def test_a_killed_workers_frames_are_made_again_with_the_same_bytes(cluster, tmp
     assert flag.exists()
     assert content(tmp_path / "away") == content(tmp_path / "home")
     assert seen[0] == (0, FRAMES) and seen[-1] == (FRAMES, FRAMES)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_a_job_whose_every_holder_died_is_sent_again(cluster):
+    from farm_job import slow_numbers
+
+    with Farm(cluster.scheduler_address) as farm:
+        found = {}
+        for index, value in farm.spread(slow_numbers, {"times": 3}, "slow")(range(FRAMES)):
+            found[index] = value
+            if len(found) == 3:
+                for process in farm.client.run(os.getpid).values():
+                    os.kill(process, signal.SIGKILL)
+    assert found == {index: 3 * index for index in range(FRAMES)}
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -4,18 +4,22 @@
     Farm("tcp://that-machine:8786")
 
 What describes the job travels once to each worker, where `build` makes the function of frame numbers out of it, once. A frame is a pure
-function of its number, so a lost worker's frames are simply made again elsewhere, and the bytes are those of one core. Workers
-must have the same version of rangecheck; what is sent are arrays and plain values, and functions by their names.
+function of its number, so a lost worker's frames are simply made again elsewhere, and the bytes are those of one core. When all that
+held the job are gone, it is sent once more to those that are left. Workers must have the same version of rangecheck; what is sent are
+arrays and plain values, and functions by their names. Each of a worker's threads makes one frame at a time, alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
-from typing import Any
+from typing import Any, TypeVar
 
-from rangecheck.animation.frames import Spread, key_of
-from rangecheck.arrays import FloatArray
+from rangecheck import kernels
+from rangecheck.animation.frames import key_of
 from rangecheck.errors import DependencyMissing, RangecheckError
 
 #: frames asked for ahead, per thread of the cluster: enough to keep it busy, few enough to keep memory bounded
@@ -23,17 +27,23 @@ AHEAD = 2
 #: a frame whose worker was lost this many times is given up: the frame itself kills workers
 LOST_WORKERS = 4
 
-Build = Callable[[Any], Callable[[int], FloatArray]]
+J = TypeVar("J")
+T = TypeVar("T")
 
-_built: dict[str, Callable[[int], FloatArray]] = {}
+_built: dict[str, Callable[[int], Any]] = {}
+_building = threading.Lock()
 
 
-def _make(token: str, build: Build, job: Any, index: int) -> FloatArray:
+def _make(token: str, build: Callable[[J], Callable[[int], T]], job: J, index: int) -> T:
     """On a worker: frame `index` of the job known by `token`."""
-    if token not in _built:
-        _built.clear()
-        _built[token] = build(job)
-    return _built[token](index)
+    with _building:
+        if token not in _built:
+            # a worker's threads are the cluster's to count
+            kernels.set_threads(1)
+            _built.clear()
+            _built[token] = build(job)
+        make: Callable[[int], T] = _built[token]
+    return make(index)
 
 
 class Farm:
@@ -48,7 +58,7 @@ class Farm:
             raise DependencyMissing("distributed", "frames on other machines", "pip install 'rangecheck[distributed]'") from None
         import dask
 
-        self.address = address
+        self.address, self.timeout_s = address, timeout_s
         dask.config.set({"distributed.scheduler.allowed-failures": LOST_WORKERS})
         try:
             self.client = Client(address, timeout=timeout_s, set_as_default=False)
@@ -71,45 +81,77 @@ class Farm:
         """Threads of all workers now."""
         return sum(self.client.nthreads().values())
 
-    def spread(self, build: Build, job: Any, key: Any) -> Spread:
+    def spread(
+        self, build: Callable[[J], Callable[[int], T]], job: J, key: str | Mapping[str, Any]
+    ) -> Callable[[Sequence[int]], Iterator[tuple[int, T]]]:
         """For `render_frames(spread=...)`: frames of build(job), made on the cluster. `build` is a function of a module that the
         workers can import; `job` is sent to each worker once; `key` is what the job is known by (see `key_of`)."""
         token = key if isinstance(key, str) else key_of(key)
 
-        def frames(indices: Sequence[int]) -> Iterator[tuple[int, FloatArray]]:
+        def frames(indices: Sequence[int]) -> Iterator[tuple[int, T]]:
             from distributed import KilledWorker, as_completed
 
             if not len(indices):
                 return
-            self._need_workers()
-            sent = self.client.scatter(job, broadcast=True, hash=False)
+            sent = self._sent(job)
             waiting = list(indices)
-            index_of: dict[str, int] = {}
+            asked: dict[str, tuple[int, Any]] = {}
+            lost: Counter[int] = Counter()
 
-            def ask() -> Any:
-                index = waiting.pop(0)
+            def ask(index: int) -> Any:
                 future = self.client.submit(_make, token, build, sent, index, pure=False, retries=LOST_WORKERS)
-                index_of[future.key] = index
+                asked[future.key] = index, sent
                 return future
 
-            first = [ask() for _ in range(min(len(waiting), AHEAD * max(1, self.threads())))]
-            ready = as_completed(first, loop=self.client.loop)
+            ahead = AHEAD * max(1, self.threads())
+            first, waiting = waiting[:ahead], waiting[ahead:]
+            ready = as_completed([ask(index) for index in first], loop=self.client.loop)
             for future in ready:
-                index = index_of.pop(future.key)
+                index, held = asked.pop(future.key)
                 try:
-                    radiance = future.result()
-                except (KilledWorker, CancelledError) as error:
-                    raise RangecheckError(
-                        f"frame {index} could not be made at {self.address} ({error}): it outlived {LOST_WORKERS} workers, or all that "
-                        "held the job are gone; see their logs, then run again: finished frames are kept"
-                    ) from None
+                    result = future.result()
+                except CancelledError as error:
+                    # what the frame was to be made of is gone with its workers
+                    lost[index] += 1
+                    if lost[index] >= LOST_WORKERS:
+                        raise self._given_up(index, error) from None
+                    if held is sent:
+                        sent = self._sent(job)
+                    ready.add(ask(index))
+                    continue
+                except KilledWorker as error:
+                    raise self._given_up(index, error) from None
                 future.release()
                 if waiting:
-                    ready.add(ask())
-                yield index, radiance
+                    ready.add(ask(waiting.pop(0)))
+                yield index, result
 
         return frames
 
+    def _sent(self, job: J) -> Any:
+        """The job on every worker that there is now; workers may be lost while it travels."""
+        for attempt in range(LOST_WORKERS):
+            self._need_workers()
+            try:
+                return self.client.scatter(job, broadcast=True, hash=False)
+            except (OSError, TimeoutError) as error:
+                lost = error
+                time.sleep(0.1 * 2**attempt)
+        raise RangecheckError(
+            f"the job could not be sent to the workers at {self.address} ({lost}); see their logs, then run again"
+        )
+
+    def _given_up(self, index: int, error: BaseException) -> RangecheckError:
+        return RangecheckError(
+            f"frame {index} could not be made at {self.address} ({error}): it outlived {LOST_WORKERS} workers; see "
+            "their logs, then run again: finished frames are kept"
+        )
+
     def _need_workers(self) -> None:
-        if not self.threads():
-            raise RangecheckError(f"the scheduler at {self.address} has no workers; start some with `dask worker {self.address}`")
+        """Workers that were started a moment ago are waited for."""
+        try:
+            self.client.wait_for_workers(1, timeout=self.timeout_s)
+        except TimeoutError:
+            raise RangecheckError(
+                f"the scheduler at {self.address} has no workers; start some with `dask worker {self.address}`"
+            ) from None

@@ -155,8 +155,8 @@ def _made(
 
         with Farm(scheduler) as farm:
             reporter.note(f"pictures are made at {scheduler} by {farm.threads()} threads")
-            for _, result in farm.spread(pictures_of, job, key)(missing):  # type: ignore[arg-type]
-                yield result  # type: ignore[misc]
+            for _, result in farm.spread(pictures_of, job, key)(missing):
+                yield result
         return
     make, workers = pictures_of(job), kernels.thread_count()
     # small pictures: each on one thread, several at a time
