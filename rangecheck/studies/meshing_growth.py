@@ -29,7 +29,7 @@ def fused_alone(points: int) -> dict[str, Any]:
     """Fuse about `points` points of the bust; how long that took and how much memory the process held, the scans included."""
     from rangecheck.surface.meshing import fuse
 
-    scans = bust_ring(width=round(math.sqrt(points / (8 * _VALID * 0.75))))
+    scans = bust_ring(width=round(math.sqrt(points / (8 * _VALID * 0.75))), in_triangles=True)
     fuse(bust_ring(2, width=64))  # kernels are loaded
     before = peak_memory_mb()
     begin = time.perf_counter()
@@ -43,7 +43,7 @@ def fused_alone(points: int) -> dict[str, Any]:
 
 def growth(quick: bool) -> Part:
     """Fusing more and more points of the same bust, up to five million."""
-    ladder = (5_000, 20_000) if quick else (100_000, 300_000, 1_000_000, 2_500_000, 5_000_000)
+    ladder = (5_000, 20_000) if quick else (150_000, 500_000, 1_600_000, 5_000_000)
     rows = [alone(fused_alone, points) for points in ladder]
     points, seconds = ([float(r[key]) for r in rows] for key in ("points", "seconds"))
     power = float(np.polyfit(np.log(points), np.log(seconds), 1)[0])

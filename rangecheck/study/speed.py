@@ -1,8 +1,8 @@
 """Speed against accuracy: every method at every setting, timed in turns, its error taken against the truth.
 
 Methods are timed interleaved, one run of each per round and every other round backwards, so that a machine that slows down or a
-neighbour that wakes up touches all alike. Warm-up runs come first and are not counted; the garbage collector waits. The median over the
-rounds is the time, the quartiles say how far to trust it.
+neighbour that wakes up touches all alike. Warm-up runs come first and are not counted; without any, the first round's results are judged.
+The garbage collector waits. The median over the rounds is the time, the quartiles say how far to trust it.
 """
 
 from __future__ import annotations
@@ -49,17 +49,20 @@ def measure(
 ) -> list[Measurement]:
     """Time every candidate in turns and take the error of its result, in the order given.
 
-    Raises SettingError without candidates or with rounds < 1, or when two share method and setting."""
+    warmups  runs before the clock starts; 0 where whoever calls has warmed up on something smaller
+    Raises SettingError without candidates, with rounds < 1 or warmups < 0, or when two share method and setting."""
     names = [(c.method, c.setting) for c in candidates]
-    if not names or rounds < 1 or warmups < 1:
-        raise SettingError(f"{len(names)} candidates, {rounds} rounds, {warmups} warm-ups; each must be at least 1")
+    if not names or rounds < 1 or warmups < 0:
+        raise SettingError(
+            f"{len(names)} candidates, {rounds} rounds, {warmups} warm-ups; the first two must be at least 1, the last at least 0"
+        )
     if len(set(names)) < len(names):
         raise SettingError(f"two candidates are called {next(n for n in names if names.count(n) > 1)}; name each setting once")
-    errors = []
-    for candidate in candidates:
+    errors = [math.nan] * len(candidates)
+    for index, candidate in enumerate(candidates if warmups else []):
         for _ in range(warmups):
             result = candidate.run()
-        errors.append(float(error_of(result)))
+        errors[index] = float(error_of(result))
         del result
     seconds: list[list[float]] = [[] for _ in candidates]
     collecting = gc.isenabled()
@@ -70,8 +73,11 @@ def measure(
             order = range(len(candidates)) if turn % 2 == 0 else reversed(range(len(candidates)))
             for index in order:
                 start = clock()
-                candidates[index].run()
+                result = candidates[index].run()
                 seconds[index].append(clock() - start)
+                if turn == 0 and not warmups:
+                    errors[index] = float(error_of(result))
+                del result
     finally:
         if collecting:
             gc.enable()
