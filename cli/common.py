@@ -94,6 +94,9 @@ _OPTIONS: dict[str, Callable[..., Any]] = {
         type=click.Choice(["flying", "isolated", "oblique", "smooth"]),
         help="Filter the scans first; may be given several times, in order.",
     ),
+    "refine": click.option(
+        "--refine", is_flag=True, help="Refine heights, within their noise, by the shading of linear brightness."
+    ),
     "json": click.option("--json", "as_json", is_flag=True, help="Print one JSON document on stdout and nothing else."),
     "log": click.option(
         "--log", type=click.Path(dir_okay=False), metavar="FILE", help="Append what is done, with the time, to FILE."

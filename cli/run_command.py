@@ -10,7 +10,7 @@ from .common import common, settings_from
 @click.option("--method", type=click.Choice(["auto", "grid", "fuse", "poisson", "pivot"]), help="How scans become triangles.")
 @click.option("--height-mm", type=float, help="Scale the finished bust to this height.")
 @click.option("--dry-run", is_flag=True, help="Check inputs, settings, encoder and room on the disk; compute nothing.")
-@common("out", "register", "filter", "unit", "size", "frames", "tolerance", "seed", "config", "set", "force")
+@common("out", "register", "filter", "refine", "unit", "size", "frames", "tolerance", "seed", "config", "set", "force")
 def command(
     scans,
     method,
@@ -18,6 +18,7 @@ def command(
     out,
     register,
     filters,
+    refine,
     unit,
     size,
     frames,
@@ -42,6 +43,7 @@ def command(
         meshing__method=method,
         scan__registration=register,
         scan__filters=filters or None,
+        scan__refine=refine or None,
         solid__height_mm=height_mm,
         turntable__frames=frames,
         light__tolerance_percent=tolerance,

@@ -37,6 +37,9 @@ class Scanning(Section):
     most_oblique_deg: Annotated[float, Field(gt=0, le=89)] = Field(80.0, description="oblique: from the normal")
     least_patch_cells: Annotated[int, Field(ge=1)] = Field(20, description="isolated: smaller patches go")
     smooth_cells: Annotated[int, Field(ge=2, le=8)] = Field(3, description="smooth: half width of the window")
+    refine: bool = Field(
+        False, description="heights refined, within their noise, by the shading of a scan's brightness (linear in light)"
+    )
     quality: bool = Field(True, description="measure what the scans are worth, with the next view")
     profile: str = Field("bust-150", description="what they are judged for: bust-75, bust-150 or bust-300")
 

@@ -74,9 +74,14 @@ def _ply(surface: Surface) -> bytes:
         vertices[name] = surface.vertices[:, axis]
     if surface.vertex_error_mm is not None:
         vertices["error_mm"] = surface.vertex_error_mm
-    faces = np.empty(len(surface.faces), [("count", "u1"), ("corners", "<i4", 3), ("part", "<i4"), ("origin", "u1")])
+    kinds: list[Any] = [("count", "u1"), ("corners", "<i4", 3), ("part", "<i4"), ("origin", "u1")]
+    if surface.refined_of_face is not None:
+        kinds.append(("refined", "u1"))
+    faces = np.empty(len(surface.faces), kinds)
     faces["count"], faces["corners"] = 3, surface.faces
     faces["part"], faces["origin"] = surface.part_of_face, surface.origin_of_face
+    if surface.refined_of_face is not None:
+        faces["refined"] = surface.refined_of_face
     names = [f"comment part {i} {json.dumps(name)}" for i, name in enumerate(surface.part_names)]
     head = [
         "ply",
@@ -90,6 +95,7 @@ def _ply(surface: Surface) -> bytes:
         "property list uchar int vertex_indices",
         "property int part",
         "property uchar origin",
+        *(["property uchar refined"] if surface.refined_of_face is not None else []),
         "end_header\n",
     ]
     return "\n".join(head).encode() + vertices.tobytes() + faces.tobytes()

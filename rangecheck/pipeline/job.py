@@ -104,7 +104,7 @@ def run(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None,
         shares = {name: shown.share_of_area(origin) for origin, name in enumerate(ORIGIN_NAMES)}
         content = document(
             "run", fit=judged.fit, verdict=judged.to_dict(), stl=stl, method=method, reason=reason, area_shares=shares,
-            scans=[scan_facts(scan) for scan in ready.scans], quality=ready.quality, registration=ready.registration, filtered=ready.filtered,
+            scans=[scan_facts(scan) for scan in ready.scans], quality=ready.quality, registration=ready.registration, filtered=ready.filtered, refined=ready.refining,
             faces=len(shown.faces), decisions=reporter.notes, front_deg=front,
             consistency=consistency,
             turntables=[{"material": t.material, "film": t.film.name, "frames": len(t.frames), "plan": t.plan} for t in turntables],

@@ -18,13 +18,16 @@ Measured = RangeScan | PointCloud
 
 @dataclass(frozen=True)
 class Prepared:
-    """Scans that may become a surface, and what was done and found: `registration` and `quality` are JSON-ready, or None."""
+    """Scans that may become a surface, and what was done and found: `registration` and `quality` are JSON-ready, or None;
+    `refined` and `refining`: what shading refined, and what is said of it."""
 
     scans: list[Measured]
     filtered: list[str] = field(default_factory=list)
     registration: dict[str, Any] | None = None
     quality: dict[str, Any] | None = None
     quality_lines: list[str] = field(default_factory=list)
+    refined: list[Any] = field(default_factory=list)
+    refining: list[dict[str, Any]] = field(default_factory=list)
 
     @property
     def grids(self) -> list[RangeScan]:
@@ -43,6 +46,12 @@ def prepared(scans: Sequence[Measured], settings: Settings, reporter: Reporter, 
     if not grids:
         return Prepared(list(scans))
     grids, filtered = _filtered(grids, settings, reporter)
+    done: list[Any] = []
+    refining: list[dict[str, Any]] = []
+    if settings.scan.refine:
+        from rangecheck.pipeline.refining import refined_scans
+
+        grids, done, refining = (shaped := refined_scans(grids, reporter)).scans, shaped.done, shaped.facts
     wanted = settings.scan.registration
     if clouds and wanted not in ("auto", "off"):
         raise SettingError(
@@ -60,7 +69,7 @@ def prepared(scans: Sequence[Measured], settings: Settings, reporter: Reporter, 
     lines: list[str] = []
     if quality:
         facts, lines = _worth(grids, None if report and report["left_out"] else samples, settings, reporter)
-    return Prepared([*_with_noise(grids, reporter), *clouds], filtered, report, facts, lines)
+    return Prepared([*_with_noise(grids, reporter), *clouds], filtered, report, facts, lines, done, refining)
 
 
 def _filtered(scans: list[RangeScan], settings: Settings, reporter: Reporter) -> tuple[list[RangeScan], list[str]]:

@@ -30,6 +30,10 @@ def mesh(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None
     except PosesRefused as refusal:
         return refused("mesh", refusal, reporter)
     surface, method, reason = surface_of(ready.scans, settings, reporter)
+    if ready.refined:
+        from rangecheck.pipeline.refining import labelled
+
+        surface = labelled(surface, ready.refined, ready.scans)
     open_edges = len(boundary_edges(surface.faces))
     with reporter.stage("writing"):
         write_mesh(surface, out, force=force)
@@ -39,10 +43,14 @@ def mesh(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None
         f"{'closed' if not open_edges else f'open: {open_edges} boundary edges'}; "
         + ", ".join(f"{share:.1%} {name}" for name, share in shares.items()),
     ]
+    if surface.refined_of_face is not None:
+        lines.append(
+            f"{surface.refined_of_face.mean():.1%} of the faces refined by the shading of the brightness (property refined of a .ply)"
+        )
     return Outcome(
         document(
             "mesh", output=out, method=method, reason=reason, faces=len(surface.faces), vertices=len(surface.vertices),
-            boundary_edges=open_edges, shares=shares, registration=ready.registration, filtered=ready.filtered, inputs=hashes(scans), seconds=reporter.seconds, settings=settings.model_dump(mode="json"),
+            boundary_edges=open_edges, shares=shares, registration=ready.registration, filtered=ready.filtered, refined=ready.refining, inputs=hashes(scans), seconds=reporter.seconds, settings=settings.model_dump(mode="json"),
         ),
         lines,
     )  # fmt: skip

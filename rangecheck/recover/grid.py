@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rangecheck.arrays import BoolArray, FloatArray, unit_vectors
+from rangecheck.arrays import BoolArray, FloatArray, IntArray, unit_vectors
 from rangecheck.errors import ScanError
 from rangecheck.recover.sight import Sight
 from rangecheck.scan import RangeScan
@@ -129,11 +129,14 @@ def _local_planes(values: FloatArray, valid: BoolArray, sigma: float) -> tuple[F
 
 def grid_sight(grid: ScanGrid, normals: FloatArray, keep: BoolArray) -> Sight:
     """The kept cells as a sight: the camera's own pixels, whose pose is not moved."""
-    chosen = keep & np.isfinite(normals).all(axis=-1)
-    pixel = np.flatnonzero(chosen)
-    n = len(pixel)
-    at = normals.reshape(-1, 3)[pixel]
+    cell = np.flatnonzero(keep & np.isfinite(normals).all(axis=-1))
+    return sight_of(grid, cell, normals.reshape(-1, 3)[cell])
+
+
+def sight_of(grid: ScanGrid, cell: IntArray, normals: FloatArray) -> Sight:
+    """Cells (m,) of the flattened grid with normals (m, 3) as what the scan's own camera sees; its pose is not moved."""
+    n = len(cell)
     return Sight(
-        pixel, np.zeros(n, np.int32), grid.points.reshape(-1, 3)[pixel], at, at, -grid.rays.reshape(-1, 3)[pixel], np.zeros(n),
+        cell, np.zeros(n, np.int32), grid.points.reshape(-1, 3)[cell], normals, normals, -grid.rays.reshape(-1, 3)[cell], np.zeros(n),
         np.full(n, grid.spacing_mm), np.zeros((n, 3, 3, 0)), (grid.valid.shape[0], grid.valid.shape[1]),
     )  # fmt: skip

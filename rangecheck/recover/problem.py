@@ -227,6 +227,16 @@ class Problem:
         in_chunks(work, n, _CHUNK)
         return Prediction(values, jacobian)
 
+    def by_normal(self, which: int) -> tuple[FloatArray, FloatArray]:
+        """What photograph `which` shows at the problem's own state, (n,), and its derivatives (n, 3) by each point's normal."""
+        photo = self.photographs[which]
+        n = len(photo.sight)
+        values, slopes = np.empty(n), np.empty((n, 3))
+        if n:
+            shown = _Shown(self, photo, np.zeros(POSE_NUMBERS))
+            in_chunks(lambda start, stop: shown.fill_by_normal(start, stop, values, slopes), n, _CHUNK)
+        return values, slopes
+
 
 def _centre_slopes(problem: Problem, state: Problem, theta: FloatArray, parameters: Sequence[Parameter]) -> list[FloatArray]:
     """How each parameter moves the middle of its light, (3,); zero where it does not."""
@@ -275,14 +285,25 @@ class _Shown:
         )  # fmt: skip
         self.radiance = np.array([light.radiance for light in self.lights])
 
+    def _shade(self, start: int, stop: int) -> tuple[FloatArray, ...]:
+        """value, by_material, by_centre, by_radius, by_point, by_normal, by_view of these pixels, source by source."""
+        m, s = stop - start, len(self.lights)
+        one: tuple[FloatArray, ...] = np.empty((m, s)), np.empty((m, s, MATERIAL_NUMBERS))
+        out = (*one, np.empty((m, s, 3)), np.empty((m, s)), *(np.empty((m, s, 3)) for _ in range(3)))
+        shade(*self.arguments, start, stop, *out)
+        return out
+
+    def fill_by_normal(self, start: int, stop: int, values: FloatArray, slopes: FloatArray) -> None:
+        value, *_, by_normal, _ = self._shade(start, stop)
+        each = self.photo.exposure * self.radiance
+        values[start:stop] = value @ each + self.photo.ambient
+        slopes[start:stop] = np.einsum("msj,s->mj", by_normal, each)
+
     def fill(
         self, start: int, stop: int, values: FloatArray, jacobian: FloatArray, parameters: Sequence[Parameter],
         centre_slopes: Sequence[FloatArray], which: int,
     ) -> None:  # fmt: skip
-        m, s = stop - start, len(self.lights)
-        value, by_material, by_radius = np.empty((m, s)), np.empty((m, s, MATERIAL_NUMBERS)), np.empty((m, s))
-        by_centre, by_point, by_normal, by_view = (np.empty((m, s, 3)) for _ in range(4))
-        shade(*self.arguments, start, stop, value, by_material, by_centre, by_radius, by_point, by_normal, by_view)
+        value, by_material, by_centre, by_radius, by_point, by_normal, by_view = self._shade(start, stop)
         exposure, ambient = self.photo.exposure, self.photo.ambient
         each = exposure * self.radiance
         light = value @ each

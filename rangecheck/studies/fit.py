@@ -18,9 +18,10 @@ from rangecheck.recover.fit import TWO_SIDED_95, Fitted, fit
 from rangecheck.recover.lights import Light, tangents
 from rangecheck.recover.problem import Guess, Photograph, Problem, Unknowns
 from rangecheck.recover.sight import sphere_sight
+from rangecheck.studies.fit_refine import refinement
 from rangecheck.study import Candidate, Line, LineChart, SpeedChart, Study, measure
 
-PARTS = ("coverage", "speed", "pictures", "noise", "limits")
+PARTS = ("coverage", "speed", "pictures", "noise", "limits", "refine")
 NOISE = 0.01
 _FAR_MM, _WAVE_UM = 1e6, 0.555
 _TITLE = "Material and lamp from photographs: honesty of the intervals, time, and limits"
@@ -28,7 +29,14 @@ _TITLE = "Material and lamp from photographs: honesty of the intervals, time, an
 
 def study(quick: bool = False, part: str | None = None) -> Study:
     """The whole study, or one of PARTS; `quick` takes a tenth of the scenes and small pictures."""
-    makers = {"coverage": _coverage, "speed": _speed, "pictures": _pictures, "noise": _noise, "limits": _limits}
+    makers = {
+        "coverage": _coverage,
+        "speed": _speed,
+        "pictures": _pictures,
+        "noise": _noise,
+        "limits": _limits,
+        "refine": refinement,
+    }
     charts: list[Any] = []
     findings: list[str] = []
     tables: dict[str, list[dict[str, Any]]] = {}

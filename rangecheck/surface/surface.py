@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from rangecheck.arrays import FloatArray, IntArray, require, unit_vectors
+from rangecheck.arrays import BoolArray, FloatArray, IntArray, require, unit_vectors
 from rangecheck.errors import ArrayError
 
 MEASURED, INTERPOLATED, INVENTED = 0, 1, 2
@@ -29,6 +29,7 @@ class Surface:
     origin_of_face  (m,) uint8: MEASURED, INTERPOLATED or INVENTED
     part_names      names of the parts; IDs in maps are part index + 1, 0 means none
     vertex_error_mm (n,) float64 expected standard error of each vertex along the normal, or None
+    refined_of_face (m,) bool whether a picture had a say in the face's heights, or None
     """
 
     vertices: FloatArray = field(repr=False)
@@ -37,6 +38,7 @@ class Surface:
     origin_of_face: IntArray = field(default_factory=lambda: np.empty(0, np.uint8), repr=False)
     part_names: tuple[str, ...] = ("surface",)
     vertex_error_mm: FloatArray | None = field(default=None, repr=False)
+    refined_of_face: BoolArray | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         vertices = require("vertices", self.vertices, (None, 3), finite=True)
@@ -56,6 +58,8 @@ class Surface:
         }
         if self.vertex_error_mm is not None:
             checked["vertex_error_mm"] = require("vertex_error_mm", self.vertex_error_mm, (len(vertices),))
+        if self.refined_of_face is not None:
+            checked["refined_of_face"] = require("refined_of_face", self.refined_of_face, (len(faces),), np.bool_)
         for name, array in checked.items():
             array = array.view()
             array.flags.writeable = False
@@ -152,6 +156,7 @@ class Surface:
             part_of_face=self.part_of_face[keep],
             origin_of_face=self.origin_of_face[keep],
             vertex_error_mm=None if self.vertex_error_mm is None else self.vertex_error_mm[used],
+            refined_of_face=None if self.refined_of_face is None else self.refined_of_face[keep],
         )
 
 

@@ -1,0 +1,281 @@
+"""Shape from what is left: the heights of a scan, within their noise, that also explain its brightness image.
+
+With q = ln range per cell, the sum of squares
+
+    sum (q - q_scan)^2 / sigma_q^2  +  sum (I(n(q)) - I_seen)^2 / sigma_I^2  +  sum (bend q)^2 / bend_sd^2
+
+is least at the refined heights: range and picture weighted by their own uncertainties (Horn, *Height and gradient from shading*, 1990;
+Nehab et al., *Efficiently combining positions and normals for precise 3D geometry*, 2005), bends by how much this surface bends. Solved by
+Gauss-Newton with the exact derivative of the shading by the slopes; the picture's residuals by Huber's weights, which leaves out shadows' edges.
+
+bend_sd is taken per place, the smallest for which range minus heights stays noise when averaged over a few cells: where more would be taken
+away than noise can be, the surface is let bend more (Lepskii's rule). Noise of neighbours must be independent.
+
+Albedo and shape cannot be told apart by one picture at fine scale, but at coarse scale the range tells the shape: where the brightness, averaged,
+differs from what the range's own shape predicts, the surface is painted, and the picture is not used there. Where that is too large a
+share, `refine` refuses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.sparse as sparse
+
+from rangecheck import rigid
+from rangecheck.arrays import BoolArray, FloatArray, IntArray
+from rangecheck.errors import ScanError
+from rangecheck.recover.fit import Fitted
+from rangecheck.recover.gradients import solve
+from rangecheck.recover.grid import ScanGrid, masked_gauss, scan_grid
+from rangecheck.recover.heights import HeightGrid, height_grid
+from rangecheck.recover.lamp import lamp_of
+from rangecheck.recover.shading import Shading, shading_of
+from rangecheck.scan import RangeScan
+from rangecheck.scan.noise import estimate_noise, surface_cosines
+from rangecheck.surface.surface import MEASURED, Surface
+
+#: bends of a surface, as 1/mm of curvature: the tightest prior tried, and the factor by which it is loosened where it takes too much away
+_CURVATURE, _LOOSER, _RUNGS = 1.0 / 60.0, 3.0, 9
+#: cells over which what is taken away is averaged, and how many of its standard deviations are still noise
+_WINDOW, _NOISE_SIGMAS = 1.5, 3.0
+#: mean square of it, in variances, up to which bends that alternate are still noise: with 28 cells to a window, three deviations above 1
+_MOST_ENERGY = 1.8
+#: cells over which brightness is compared with the shading of the range, and the share by which paint-free brightness may differ there
+_COARSE, _PAINT = 5.0, 0.05
+#: cells over which albedo may change without being called paint
+_SLOW = 30.0
+#: share of the well-lit cells that may be painted before the picture is refused
+MOST_PAINTED = 0.35
+_STEPS, _DOUBTS, _BEND = 5, 4, 2.0
+_STEEPEST = 5.7
+#: noise of slanted cells that is believed, in that of cells seen face on
+_SLANTED = 1.25
+_LEAST_LIGHT, _LEAST_COSINE = 0.25, 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """A scan refined by its picture.
+
+    scan       the same scan with refined ranges
+    refined    (h, w) where the picture had a say;  painted (h, w) where it was well lit but not believed
+    moved_mm   (h, w) refined less measured range
+    noise_mm   (h, w) the range's standard deviation that was assumed;  picture_noise: that of the brightness, parts of full scale
+    fitted     material and lamp
+    """
+
+    scan: RangeScan
+    refined: BoolArray
+    painted: BoolArray
+    moved_mm: FloatArray
+    noise_mm: FloatArray
+    picture_noise: float
+    fitted: Fitted | None
+
+
+def refine(scan: RangeScan, *, fitted: Fitted | None = None, noise_mm: float | None = None, use_picture: bool = True) -> Refined:
+    """`scan` refined by its brightness, linear in light.
+
+    fitted: material and lamp, found on the scan itself if not given. noise_mm: of range, estimated from the scan if not given.
+    use_picture False: what range and bends alone give. Raises ScanError without brightness, and where albedo varies too much to tell
+    shape from paint."""
+    grid = scan_grid(scan)
+    noise = _noise(scan, noise_mm)
+    heights = height_grid(
+        np.where(grid.valid, scan.range_mm, np.nan).astype(float),
+        grid.rays,
+        _STEEPEST,
+        4.0 * noise / np.nan_to_num(scan.range_mm, nan=1.0),
+    )
+    measured = np.log(scan.range_mm.astype(float)).reshape(-1)[heights.cell]
+    sigma = (noise / scan.range_mm).reshape(-1)[heights.cell]
+    model = _Model(heights, measured, sigma, _bend_unit(grid, heights))
+    q = model.settle()
+    if not use_picture:
+        return _done(scan, heights, q, np.zeros(0, int), np.zeros(0, int), noise, 0.0, None)
+    smooth = replace(grid, points=heights.spread(np.exp(q)[:, None] * heights.rays))
+    normals, _, _ = heights.normals(q)
+    fitted = fitted or lamp_of(smooth, heights.cell[heights.inner], normals)
+    shading = shading_of(fitted, smooth, heights.cell[heights.inner])
+    believed, painted, albedo, spread = _believed(heights, shading, grid, normals)
+    lit = int(believed.sum() + painted.sum())
+    if lit == 0:
+        raise ScanError(f"{scan.name}: no cell is lit well enough to be refined by its brightness", name=scan.name)
+    if painted.sum() > MOST_PAINTED * lit:
+        raise ScanError(
+            f"{scan.name}: on {painted.sum() / lit:.0%} of the well-lit cells the brightness differs from the shading of the scan's own shape by more than "
+            f"{_PAINT:.0%} over {_COARSE:g} cells: the albedo varies too much to tell paint from shape (at most {MOST_PAINTED:.0%} may); "
+            "use the scan unrefined",
+            name=scan.name, painted=float(painted.sum() / lit),
+        )  # fmt: skip
+    alone = q
+    for _ in range(_DOUBTS):
+        q = model.with_picture(q, shading, believed, albedo, spread)
+        # where picture and range cannot both be right within their noise the range is
+        doubted = model.strained(q)[heights.inner] & ~model.strained(alone)[heights.inner] & believed
+        if not doubted.any():
+            break
+        believed, painted = believed & ~doubted, painted | doubted
+    return _done(scan, heights, q, heights.inner[believed], heights.inner[painted], noise, spread, fitted)
+
+
+def _noise(scan: RangeScan, noise_mm: float | None) -> FloatArray:
+    """(h, w) standard deviation of each range."""
+    if noise_mm is not None:
+        return np.full(scan.range_mm.shape, float(noise_mm))
+    found = estimate_noise(scan)
+    cosine = surface_cosines(scan, 4.0 * found.normal_mm, window=3)
+    ranges = np.nan_to_num(scan.range_mm, nan=found.reference_mm)
+    # where steep cells bend more than they are noisy their noise is overrated, and detail would go with it
+    return np.minimum(found.sigma_mm(ranges, np.nan_to_num(cosine, nan=1.0)), _SLANTED * found.sigma_mm(ranges))
+
+
+def _bend_unit(grid: ScanGrid, heights: HeightGrid) -> FloatArray:
+    """Second difference of q of a surface of curvature 1/mm seen face on, per bend."""
+    ranges = np.linalg.norm(grid.points.reshape(-1, 3)[heights.cell], axis=1)
+    spacing = np.linalg.norm(heights.ray_u, axis=1) * np.linalg.norm(heights.ray_v, axis=1) * ranges
+    return np.asarray(spacing[heights.bend_cell])
+
+
+class _Model:
+    """The sum of squares and its least."""
+
+    def __init__(self, heights: HeightGrid, measured: FloatArray, sigma: FloatArray, bend_unit: FloatArray) -> None:
+        self.heights, self.measured, self.sigma, self.bend_unit = heights, measured, sigma, bend_unit
+        self.curvature: FloatArray = np.full(len(measured), _CURVATURE)
+        self.data = sparse.diags_array(1.0 / sigma**2)
+
+    def _prior(self) -> sparse.csr_array:
+        weight = 1.0 / (self.curvature[self.heights.bend_cell] * self.bend_unit)
+        rows = sparse.diags_array(weight) @ self.heights.bend
+        return sparse.csr_array(self.data + rows.T @ rows)
+
+    def settle(self) -> FloatArray:
+        """Heights of least range and bends, the bends loosened where they take away more than noise."""
+        q = self.measured
+        for _ in range(_RUNGS):
+            self.matrix = self._prior()
+            q = solve(self.matrix, self.measured / self.sigma**2, q, self.sigma)
+            strained = self.strained(q)
+            if not strained.any():
+                break
+            self.curvature = np.where(strained, self.curvature * _LOOSER, self.curvature)
+        self.matrix = self._prior()
+        return solve(self.matrix, self.measured / self.sigma**2, q, self.sigma)
+
+    def strained(self, q: FloatArray) -> BoolArray:
+        """(n,) cells around which what was taken away is no noise."""
+        from scipy.ndimage import maximum_filter
+
+        ones = self.heights.spread(np.ones(len(q)), 0.0)
+        taken = self.heights.spread((q - self.measured) / self.sigma, 0.0)
+        # mean over a Gaussian window has 1 / (2 sqrt(pi) w) of the noise of one cell
+        away = np.nan_to_num(masked_gauss(taken, ones, _WINDOW)) * 2.0 * np.sqrt(np.pi) * _WINDOW
+        energy = np.nan_to_num(masked_gauss(taken * taken, ones, _WINDOW))
+        odd = (np.abs(away) > _NOISE_SIGMAS) | (energy > _MOST_ENERGY)
+        near = maximum_filter(odd.astype(np.uint8), size=2 * round(_WINDOW) + 1)
+        return np.asarray(near.reshape(-1)[self.heights.cell] > 0)
+
+    def with_picture(self, q: FloatArray, shading: Shading, believed: BoolArray, albedo: FloatArray, spread: float) -> FloatArray:
+        """Gauss-Newton from `q` with the picture's residuals of the believed inner cells."""
+        heights = self.heights
+        lift = shading.seen[believed]
+        # a lamp and an albedo are not known better than a few per cent
+        noise = np.hypot(spread, 0.01 * lift)
+        for _ in range(_STEPS):
+            normals, slope_u, slope_v = heights.normals(q)
+            value, by_normal = shading.at(normals)
+            r = (albedo * value - shading.seen)[believed] / noise
+            weight = np.minimum(1.0, _BEND / np.maximum(np.abs(r), 1e-9))
+            a = ((albedo * (by_normal * slope_u).sum(1))[believed] / noise)[:, None]
+            b = ((albedo * (by_normal * slope_v).sum(1))[believed] / noise)[:, None]
+            rows = heights.by_u[believed].multiply(a) + heights.by_v[believed].multiply(b)
+            rows = sparse.csr_array(rows)
+            matrix = sparse.csr_array(self.matrix + rows.T @ (sparse.diags_array(weight) @ rows))
+            right = self.measured / self.sigma**2 + rows.T @ (weight * (rows @ q - r))
+            moved = solve(matrix, right, q, self.sigma)
+            step = float(np.max(np.abs(moved - q) / self.sigma))
+            q = moved
+            if step < 0.02:
+                break
+        return q
+
+
+def _believed(
+    heights: HeightGrid, shading: Shading, grid: ScanGrid, normals: FloatArray
+) -> tuple[BoolArray, BoolArray, FloatArray, float]:
+    """Of the inner cells: (those whose brightness is shading, those that look painted, slow albedo relative to the fit's, picture noise)."""
+    from scipy.ndimage import maximum_filter
+
+    seen = shading.seen
+    predicted, _ = shading.at(normals)
+    facing = -(normals * heights.rays[heights.inner]).sum(1)
+    bright = _LEAST_LIGHT * float(np.quantile(predicted, 0.95))
+    lit = (predicted > bright) & (facing > _LEAST_COSINE) & (seen > 0.2 * bright) & (seen < shading.saturation)
+    cell = heights.cell[heights.inner]
+
+    def spread(values: FloatArray) -> FloatArray:
+        grid_values = np.zeros(heights.shape[0] * heights.shape[1])
+        grid_values[cell] = values
+        return grid_values.reshape(heights.shape)
+
+    weight = spread(lit.astype(float))
+    apart = spread(np.where(lit, np.log(np.maximum(seen, 1e-9) / np.maximum(predicted, 1e-9)), 0.0))
+    coarse = masked_gauss(apart, weight, _COARSE)
+    slow = coarse
+    for _ in range(3):
+        kept = weight * (np.abs(np.nan_to_num(coarse - slow)) < _PAINT)
+        found = masked_gauss(apart, kept, _SLOW)
+        slow = np.where(np.isfinite(found), found, 0.0)
+    odd = (weight > 0) & ~(np.abs(coarse - slow) < _PAINT)
+    odd = maximum_filter(odd.astype(np.uint8), size=2 * round(_COARSE) + 1) > 0
+    painted = lit & odd.reshape(-1)[cell]
+    albedo = np.exp(slow.reshape(-1)[cell])
+    return lit & ~painted, painted, albedo, _picture_noise(grid.picture, spread(lit.astype(float)) > 0)
+
+
+def _picture_noise(picture: FloatArray, where: BoolArray) -> float:
+    """Standard deviation of the picture's finest structure (Immerkaer 1996), which noise and texture both are."""
+    from scipy.ndimage import convolve, minimum_filter
+
+    mask = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]]) / 6.0
+    answer = convolve(np.nan_to_num(picture), mask)
+    inside = minimum_filter(where.astype(np.uint8), size=3) > 0
+    return float(np.median(np.abs(answer[inside])) / 0.6744897501960817) if inside.any() else 0.01
+
+
+def _done(
+    scan: RangeScan, heights: HeightGrid, q: FloatArray, refined: IntArray, painted: IntArray, noise: FloatArray, spread: float,
+    fitted: Fitted | None,
+) -> Refined:  # fmt: skip
+    ranges = heights.spread(np.exp(q))
+    h, w = heights.shape
+
+    def mask(cells: IntArray) -> BoolArray:
+        flat = np.zeros(h * w, bool)
+        flat[heights.cell[cells]] = True
+        return flat.reshape(h, w)
+
+    better = replace(scan, range_mm=np.where(scan.valid, ranges, np.nan).astype(np.float32))
+    return Refined(better, mask(refined), mask(painted), ranges - scan.range_mm, noise, spread, fitted)
+
+
+def refined_faces(surface: Surface, refined: Sequence[Refined], reach_mm: float) -> BoolArray:
+    """(m,) which measured faces of a surface stand on refined cells: their middles lie within `reach_mm`, along the ray, of a cell that the picture had a
+    say in. World frame."""
+    found = np.zeros(len(surface.faces), bool)
+    middles = surface.triangles.mean(axis=1)
+    for one in refined:
+        scan = one.scan
+        uv, away = scan.camera.project(rigid.move_points(rigid.inverse(scan.world_from_scan), middles))
+        inside = np.isfinite(uv).all(axis=1) & np.isfinite(away)
+        column, row = (np.rint(np.where(inside, uv[:, k], -1.0)).astype(np.int64) for k in (0, 1))
+        h, w = scan.range_mm.shape
+        inside &= (row >= 0) & (row < h) & (column >= 0) & (column < w)
+        at = np.flatnonzero(inside)
+        cells = row[at], column[at]
+        found[at] |= one.refined[cells] & (np.abs(scan.range_mm[cells] - away[at]) < reach_mm)
+    return found & (surface.origin_of_face == MEASURED)

@@ -1,0 +1,129 @@
+"""Shape refined by shading, against truth: slopes and heights of the sample bust's scans before and after, clean and painted.
+
+The sample range finder (0.2 mm of noise, 640 x 480) sees the bust from two sides; its picture has 1 % of full scale of Gaussian noise. Slopes are those of
+central differences on the grid, errors angles to the true normal. Heights are compared in windows of 16 x 16 cells, wherever a quarter of them is measured.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from rangecheck.arrays import BoolArray, FloatArray
+from rangecheck.errors import ScanError
+from rangecheck.recover.refine import Refined, refine
+from rangecheck.scan import RangeScan
+from rangecheck.scan.sample import CAMERA, FINDER, TARGET_MM
+from rangecheck.scan.simulate import Finish, SimulatedScan, ring_of_poses, simulate_scan
+from rangecheck.study import Line, LineChart
+
+#: share of light that the bust gives back, and noise of its picture
+ALBEDO, PICTURE_NOISE = 0.7, 0.01
+_WINDOW = 16
+
+
+def bust_picture(azimuth_deg: float, seed: int, *, spots: int = 0, step: int = 1) -> tuple[SimulatedScan, RangeScan]:
+    """A view of the sample bust with its truth, and the scan with a noisy picture; `spots` round spots of darker paint, 6 to 15 mm in radius.
+
+    step: only every step-th pixel along both sides."""
+    from rangecheck.raycast.implicit import ImplicitCaster
+
+    camera = replace(
+        CAMERA, width=CAMERA.width // step, height=CAMERA.height // step, fx=CAMERA.fx / step, fy=CAMERA.fy / step, cx=CAMERA.cx / step,
+        cy=CAMERA.cy / step,
+    )  # fmt: skip
+    pose = ring_of_poses(1, FINDER.working_distance_mm, target_mm=TARGET_MM, first_deg=azimuth_deg)[0]
+    made = simulate_scan(
+        ImplicitCaster.of_bust(), camera, pose, FINDER, seed, with_brightness=True, name="bust", finish=Finish(diffuse=ALBEDO)
+    )
+    assert made.scan.brightness is not None
+    rng = np.random.default_rng(seed)
+    bright = made.scan.brightness.astype(np.float64)
+    points = made.scan.grid_points_mm
+    for _ in range(spots):
+        x, y, radius, paint = rng.normal(0.0, 60.0), rng.normal(0.0, 90.0), rng.uniform(6.0, 15.0), rng.uniform(0.4, 0.85)
+        bright = np.where(np.hypot(points[..., 0] - x, points[..., 1] - y) < radius, paint * bright, bright)
+    noisy = np.clip(bright + rng.normal(0.0, PICTURE_NOISE, bright.shape), 0.0, 1.0)
+    return made, replace(made.scan, brightness=noisy.astype(np.float32))
+
+
+def slope_errors_deg(scan: RangeScan, made: SimulatedScan) -> FloatArray:
+    """(h, w) angle between the grid's normals by central differences and the true ones, NaN where either is missing."""
+    points = scan.grid_points_mm
+    u, v = np.full(points.shape, np.nan), np.full(points.shape, np.nan)
+    u[:, 1:-1], v[1:-1] = points[:, 2:] - points[:, :-2], points[2:] - points[:-2]
+    normals = np.cross(v, u)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    truth = made.true_normal @ scan.world_from_scan[:3, :3]
+    return np.asarray(np.degrees(np.arccos(np.clip((normals * truth).sum(-1), -1.0, 1.0))))
+
+
+def window_ratios(before: FloatArray, after: FloatArray) -> FloatArray:
+    """(k,) rms of height errors after over before, window by window."""
+    known = np.isfinite(before) & np.isfinite(after)
+    found = []
+    for row in range(0, before.shape[0] - _WINDOW + 1, _WINDOW):
+        for column in range(0, before.shape[1] - _WINDOW + 1, _WINDOW):
+            here = (slice(row, row + _WINDOW), slice(column, column + _WINDOW))
+            if known[here].sum() >= _WINDOW**2 // 4:
+                found.append(_rms(after[here][known[here]]) / _rms(before[here][known[here]]))
+    return np.array(found)
+
+
+def judged(made: SimulatedScan, scan: RangeScan, refined: Refined, which: BoolArray) -> dict[str, float]:
+    """Errors before and after: slopes of the cells `which`, of all cells, heights, and the worst and the middle window."""
+    before, after = slope_errors_deg(scan, made), slope_errors_deg(refined.scan, made)
+    known = np.isfinite(before) & np.isfinite(after)
+    chosen = known & which
+    high, low = scan.range_mm - made.true_range_mm, refined.scan.range_mm - made.true_range_mm
+    both = np.isfinite(high) & np.isfinite(low)
+    ratios = window_ratios(high, low)
+    return {
+        "cells": int(chosen.sum()), "slope_before_deg": _rms(before[chosen]), "slope_after_deg": _rms(after[chosen]),
+        "all_before_deg": _rms(before[known]), "all_after_deg": _rms(after[known]),
+        "height_before_mm": _rms(high[both]), "height_after_mm": _rms(low[both]),
+        "worst_window": float(ratios.max()), "middle_window": float(np.median(ratios)), "windows": len(ratios),
+    }  # fmt: skip
+
+
+def _rms(values: FloatArray) -> float:
+    return math.sqrt(float((values**2).mean()))
+
+
+def refinement(quick: bool) -> tuple[list[Any], list[str], list[dict[str, Any]]]:
+    """The part `refine` of the study `fit`."""
+    step = 2 if quick else 1
+    cases = [(20.0, 0), (20.0, 3)] if quick else [(20.0, 0), (20.0, 3), (20.0, 40), (-60.0, 0)]
+    rows: list[dict[str, Any]] = []
+    findings: list[str] = []
+    for azimuth, spots in cases:
+        made, scan = bust_picture(azimuth, 11 + int(azimuth), spots=spots, step=step)
+        name = f"{azimuth:g} degrees, {spots if spots else 'no'} painted spots"
+        row: dict[str, Any] = {"azimuth_deg": azimuth, "spots": spots, "cells_of_scan": int(scan.valid.sum())}
+        try:
+            refined = refine(scan)
+        except ScanError as refusal:
+            rows.append(row | {"refused": str(refusal)})
+            findings.append(f"{name}: refused; {refusal}")
+            continue
+        alone = refine(scan, use_picture=False)
+        numbers, without = (judged(made, scan, one, refined.refined) for one in (refined, alone))
+        rows.append(row | numbers | {"without_picture_deg": without["slope_after_deg"]})
+        findings += [
+            f"{name}: slope error of the {numbers['cells'] / scan.valid.sum():.0%} of the cells that the picture refined "
+            f"{numbers['slope_before_deg']:.2f} to {numbers['slope_after_deg']:.2f} degrees rms "
+            f"(times {numbers['slope_after_deg'] / numbers['slope_before_deg']:.2f}; without the picture {without['slope_after_deg']:.2f}), of all "
+            f"cells {numbers['all_before_deg']:.2f} to {numbers['all_after_deg']:.2f}",
+            f"  heights {numbers['height_before_mm']:.4f} to {numbers['height_after_mm']:.4f} mm rms; of {numbers['windows']} windows the worst is times "
+            f"{numbers['worst_window']:.3f}, the middle one {numbers['middle_window']:.3f}",
+        ]
+    kept = [row for row in rows if "refused" not in row]
+    chart = LineChart(
+        "refine", "Slope error after refinement over before, by case", "case", "ratio",
+        [Line("refined", list(range(len(kept))), [r["slope_after_deg"] / r["slope_before_deg"] for r in kept], True),
+         Line("worst window of heights", list(range(len(kept))), [r["worst_window"] for r in kept], True)], level=0.5,
+    )  # fmt: skip
+    return [chart], findings, rows

@@ -1,0 +1,135 @@
+"""Heights refined by shading: a rippled ball whose picture is known exactly, seen by a noisy range finder."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rangecheck_cli.main import exit_status
+
+from rangecheck.errors import ScanError
+from rangecheck.optics import PinholeCamera
+from rangecheck.recover.grid import scan_grid
+from rangecheck.recover.heights import height_grid
+from rangecheck.recover.refine import refine, refined_faces
+from rangecheck.scan import RangeScan
+from rangecheck.surface.meshing import grid_mesh
+
+SIZE, RADIUS_MM, AWAY_MM, NOISE_MM = 110, 60.0, 400.0, 0.2
+CENTRE = np.array([0.0, 0.0, AWAY_MM])
+LAMP_MM = np.array([150.0, -60.0, 0.0])
+
+
+def rippled(spots=0, noise_mm=NOISE_MM, seed=0):
+    """(scan, true range, true normals): radius 60 mm with ripples of 0.15 mm, 8 mm long, that 0.2 mm of noise hide."""
+    camera = PinholeCamera.from_field_of_view(SIZE, SIZE, 15.0)
+    _, rays = camera.pixel_rays()
+    b = rays @ CENTRE
+    inside = b * b - (AWAY_MM**2 - RADIUS_MM**2)
+    smooth = b - np.sqrt(np.where(inside > 0, inside, np.nan))
+    points = smooth[..., None] * rays
+    ripple = 0.15 * np.sin(2 * np.pi * points[..., 0] / 8.0) * np.sin(2 * np.pi * points[..., 1] / 11.0)
+    ranges = smooth + ripple
+    points = ranges[..., None] * rays
+    u, v = np.gradient(points, axis=1), np.gradient(points, axis=0)
+    normals = np.cross(v, u)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    to_lamp = LAMP_MM - points
+    away = np.linalg.norm(to_lamp, axis=-1)
+    bright = 0.6 * np.maximum((normals * to_lamp).sum(-1) / away, 0.0) * (400.0 / away) ** 2
+    rng = np.random.default_rng(seed)
+    for _ in range(spots):
+        x, y = rng.uniform(-40, 40, 2)
+        bright = np.where(np.hypot(points[..., 0] - x, points[..., 1] - y) < 7.0, bright * rng.uniform(0.4, 0.8), bright)
+    seen = -(normals * rays).sum(-1) > 0.3
+    measured = np.where(seen, ranges + rng.normal(0, noise_mm, ranges.shape), np.nan).astype(np.float32)
+    picture = np.nan_to_num(np.clip(bright + rng.normal(0, 0.01, bright.shape), 0, 1)).astype(np.float32)
+    return RangeScan(measured, camera, brightness=picture, name="ball"), ranges, normals
+
+
+def slope_error(scan, normals, where):
+    points = scan.grid_points_mm
+    n = np.cross(np.gradient(points, axis=0), np.gradient(points, axis=1))
+    n /= np.linalg.norm(n, axis=-1, keepdims=True)
+    angle = np.degrees(np.arccos(np.clip((n * normals).sum(-1), -1, 1)))[where]
+    return np.sqrt(np.nanmean(angle**2))
+
+
+def rms(values):
+    return np.sqrt(np.nanmean(values**2))
+
+
+@pytest.fixture(scope="module")
+def clean():
+    scan, ranges, normals = rippled()
+    return scan, ranges, normals, refine(scan)
+
+
+def test_normals_turn_with_the_slopes_as_their_derivatives_say():
+    scan, ranges, _ = rippled(noise_mm=0.0)
+    grid = scan_grid(scan)
+    heights = height_grid(scan.range_mm.astype(float), grid.rays, 5.7, 0.0)
+    q = np.log(ranges.reshape(-1)[heights.cell])
+    n, by_u, by_v = heights.normals(q)
+    bump = 1e-6 * np.random.default_rng(0).normal(size=len(q))
+    ahead, behind = heights.normals(q + bump)[0], heights.normals(q - bump)[0]
+    expected = by_u * (heights.by_u @ bump)[:, None] + by_v * (heights.by_v @ bump)[:, None]
+    assert np.abs((ahead - behind) / 2 - expected).max() < 1e-6 * np.abs(expected).max() + 1e-11
+    assert (n * heights.rays[heights.inner]).sum(1).max() < 0.0
+
+
+def test_slopes_come_twice_as_near_to_the_truth_and_heights_no_farther(clean):
+    scan, ranges, normals, out = clean
+    assert out.refined.sum() > 0.6 * scan.valid.sum()
+    assert slope_error(out.scan, normals, out.refined) < 0.5 * slope_error(scan, normals, out.refined)
+    assert rms(out.scan.range_mm - ranges) < rms(scan.range_mm - ranges)
+
+
+def test_the_picture_shows_ripples_that_range_alone_does_not(clean):
+    scan, _, normals, out = clean
+    alone = refine(scan, use_picture=False)
+    assert slope_error(out.scan, normals, out.refined) < 0.75 * slope_error(alone.scan, normals, out.refined)
+
+
+def test_paint_is_not_taken_for_shape(clean):
+    scan, ranges, normals = rippled(spots=3)
+    out = refine(scan, fitted=clean[3].fitted)
+    assert out.painted.any()
+    assert slope_error(out.scan, normals, out.refined) < 0.5 * slope_error(scan, normals, out.refined)
+    before, after = scan.range_mm - ranges, out.scan.range_mm - ranges
+    for rows in np.array_split(np.arange(SIZE), 8):
+        for columns in np.array_split(np.arange(SIZE), 8):
+            here = np.ix_(rows, columns)
+            if np.isfinite(before[here]).sum() > 60:
+                assert rms(after[here]) < 1.05 * rms(before[here])
+
+
+def test_much_paint_is_refused_and_so_is_a_scan_without_a_picture(clean):
+    scan = clean[0]
+    points = np.nan_to_num(scan.grid_points_mm)
+    checks = np.where((np.floor(points[..., 0] / 9) + np.floor(points[..., 1] / 9)) % 2 > 0, 0.5, 1.0)
+    with pytest.raises(ScanError, match="albedo varies too much"):
+        refine(replace(scan, brightness=(scan.brightness * checks).astype(np.float32)), fitted=clean[3].fitted)
+    with pytest.raises(ScanError, match="no brightness"):
+        refine(replace(scan, brightness=None))
+    with pytest.raises(ScanError, match="face the camera"):
+        refine(replace(scan, brightness=np.zeros_like(scan.brightness)))
+
+
+def test_faces_on_refined_cells_are_told_and_keep_their_origin(clean):
+    out = clean[3]
+    surface = grid_mesh(out.scan)
+    label = refined_faces(surface, [out], 1.0)
+    assert 0.5 < label.mean() < 1.0
+    labelled = replace(surface, refined_of_face=label)
+    assert np.array_equal(labelled.with_faces(np.flatnonzero(label)).refined_of_face, np.ones(label.sum(), bool))
+    assert np.array_equal(labelled.origin_of_face, surface.origin_of_face)
+
+
+def test_the_command_refines_only_when_asked(tmp_path, clean):
+    from rangecheck.scan.readers import write_scans
+
+    write_scans(tmp_path / "in", [clean[0]], step_mm=0.01)
+    for name, more in (("raw.ply", []), ("fine.ply", ["--refine"])):
+        assert exit_status(["mesh", str(tmp_path / "in"), "--method", "grid", "-o", str(tmp_path / name), "-q", *more]) == 0
+    assert b"property uchar refined" not in (tmp_path / "raw.ply").read_bytes()[:1000]
+    assert b"property uchar refined" in (tmp_path / "fine.ply").read_bytes()[:1000]
