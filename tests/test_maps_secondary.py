@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from rangecheck import kernels, rigid
+from rangecheck.analytic.reflections import box_corner_chain
 from rangecheck.errors import ArrayError
 from rangecheck.export.map_files import write_chain, write_shadows, write_value_map
 from rangecheck.export.pictures import read_map_png16, read_png
@@ -32,41 +33,6 @@ def box_corner():
     return join([rectangle((0, 0, 0), y, z, "x wall"), rectangle((0, 0, 0), z, x, "floor"), rectangle((0, 0, 0), x, y, "z wall")])
 
 
-def corner_chain(origins, directions, bounces):
-    """IDs met one after the other by rays in the box corner, from the mirror law alone, and how near any hit comes to an edge."""
-    o, d = origins.copy(), directions.copy()
-    ids = np.zeros((bounces + 1, len(o)), int)
-    clearance = np.full(len(o), np.inf)
-    live = np.ones(len(o), bool)
-    last = np.full(len(o), -1)
-    for k in range(bounces + 1):
-        with np.errstate(divide="ignore", invalid="ignore"):
-            t = -o / d
-        t[(d >= 0) | (last[:, None] == np.arange(3))] = np.inf
-        # a wall counts where the ray meets its square; how near it comes to the square's border is kept
-        met = o[:, None, :] + np.where(np.isfinite(t), t, 0.0)[:, :, None] * d[:, None, :]
-        others = np.array([[1, 2], [2, 0], [0, 1]])
-        inside = np.ones_like(t, bool)
-        border = np.full_like(t, np.inf)
-        for axis in range(3):
-            q = met[:, axis, others[axis]]
-            margin = np.minimum(q, SIDE - q).min(axis=1)
-            inside[:, axis] = margin >= 0
-            border[:, axis] = np.where(np.isfinite(t[:, axis]), np.abs(margin), np.inf)
-        clearance = np.where(live, np.minimum(clearance, border.min(axis=1)), clearance)
-        t[~inside] = np.inf
-        wall = np.argmin(t, axis=1)
-        reach = t[np.arange(len(o)), wall]
-        live = live & np.isfinite(reach)
-        ids[k] = np.where(live, wall + 1, 0)
-        o = np.where(live[:, None], o + np.where(live, reach, 0.0)[:, None] * d, o)
-        flip = np.ones_like(d)
-        flip[np.arange(len(o)), wall] = np.where(live, -1.0, 1.0)
-        d = d * flip
-        last = np.where(live, wall, last)
-    return ids, clearance
-
-
 @pytest.mark.parametrize("eye", [(160.0, 140.0, 170.0), (300.0, 60.0, 90.0)])
 def test_every_chain_in_a_box_corner_is_the_analytic_one(eye):
     surface = box_corner()
@@ -75,7 +41,7 @@ def test_every_chain_in_a_box_corner_is_the_analytic_one(eye):
     maps = trace_maps(surface, camera, pose)
     chain = trace_chain(surface, maps, bounces=3)
     directions = camera.pixel_rays()[1].reshape(-1, 3) @ pose[:3, :3].T
-    ids, clearance = corner_chain(np.tile(eye, (len(directions), 1)).astype(float), directions, 3)
+    ids, clearance = box_corner_chain(np.tile(eye, (len(directions), 1)), directions, SIDE, 3)
     away = clearance > 1e-4 * SIDE
     assert away.mean() > 0.95
     found = np.concatenate([maps.part_id[None], chain.part_ids]).reshape(4, -1)

@@ -1,89 +1,33 @@
 """Line drawings agree with the maps: where the ID changes there is a line, and where there is a line something changes."""
 
+import math
 import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from rangecheck import rigid
 from rangecheck.errors import SceneError
-from rangecheck.files import presets_folder
-from rangecheck.maps import trace_maps
-from rangecheck.modeler import draw, model_from_dict, read_model, svg_text, write_svg
+from rangecheck.modeler import draw, model_from_dict, svg_text, write_svg
 from rangecheck.modeler.draw import BORDER, CREASE, SILHOUETTE
 from rangecheck.optics import OrthographicCamera, PinholeCamera
+from rangecheck.studies.pictures_lines import SCENES, agreement, shipped
 
 CAMERA = PinholeCamera.from_field_of_view(240, 200, 30)
 BLOCK = {"name": "block", "shape": "box", "size_mm": [60, 40, 50]}
-BORE = {"name": "bore", "shape": "cylinder", "radius_mm": 14, "height_mm": 90}
-SCENES = {
-    "box": [BLOCK],
-    "bored": [{"name": "a", "shape": "difference", "of": [BLOCK, BORE]}],
-    "torus on sheet": [
-        {"name": "ring", "shape": "torus", "major_mm": 30, "minor_mm": 10, "at_mm": [0, 10, 0]},
-        {"name": "sheet", "shape": "plane", "size_mm": [120, 120]},
-    ],
-    "cone before ball": [
-        {"name": "cone", "shape": "cone", "radius_mm": 20, "height_mm": 50, "at_mm": [20, 30, 40]},
-        {"name": "ball", "shape": "sphere", "radius_mm": 25, "at_mm": [-5, 0, -20]},
-    ],
-    "cross": [
-        {
-            "name": "cross",
-            "shape": "union",
-            "of": [{"name": "bar", "shape": "box", "size_mm": [90, 16, 16]}, {"name": "post", "shape": "cylinder", "radius_mm": 12, "height_mm": 80}],
-        }
-    ],
-}  # fmt: skip
 POSE = rigid.look_at((120, 110, 170), (0, 5, 0))
-
-
-def finer(camera, factor):
-    """The same view with `factor` times as many pixels each way."""
-    return PinholeCamera(
-        camera.width * factor, camera.height * factor, camera.fx * factor, camera.fy * factor,
-        (camera.cx + 0.5) * factor - 0.5, (camera.cy + 0.5) * factor - 0.5,
-    )  # fmt: skip
-
-
-def inked(drawing, factor):
-    """Distance in pixels of the drawing from each pixel of a picture `factor` times finer to the nearest visible line."""
-    import cv2
-
-    paper = np.ones((drawing.height * factor, drawing.width * factor), np.uint8)
-    for line in drawing.visible():
-        points = np.rint((line.points + 0.5) * factor - 0.5).astype(np.int32)
-        cv2.polylines(paper, [points], False, 0)
-    return cv2.distanceTransform(paper, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) / factor
 
 
 @pytest.mark.parametrize("name", SCENES)
 def test_visible_lines_and_borders_of_the_id_map_agree_to_a_pixel(name):
-    import cv2
-
-    model = model_from_dict({"tolerance_mm": 0.02, "body": SCENES[name]})
-    drawing = draw(model, CAMERA, POSE)
-    factor = 4
-    maps = trace_maps(model.surface, finer(CAMERA, factor), POSE)
-    ids = maps.part_id
-    changes = np.zeros(ids.shape, bool)
-    changes[:, 1:] |= ids[:, 1:] != ids[:, :-1]
-    changes[1:] |= ids[1:] != ids[:-1]
-    assert changes.sum() > 300
-    # every border of the ID map has a visible line within a pixel
-    assert inked(drawing, factor)[changes].max() <= 1.0
-    # every visible line has a border of the ID map within a pixel, or, where a face hides a part of itself, a jump in depth
-    depth = np.nan_to_num(maps.depth_mm, nan=1e4)
-    bend = np.zeros(ids.shape, bool)
-    bend[:, 1:-1] |= np.abs(depth[:, 2:] - 2 * depth[:, 1:-1] + depth[:, :-2]) > 0.15
-    bend[1:-1] |= np.abs(depth[2:] - 2 * depth[1:-1] + depth[:-2]) > 0.15
-    near = cv2.distanceTransform((~(changes | bend)).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) / factor
-    for line in drawing.visible():
-        steps = np.linspace(0, 1, 50)
-        points = np.concatenate([a + steps[:, None] * (b - a) for a, b in zip(line.points, line.points[1:])])
-        at = np.rint((points + 0.5) * factor - 0.5).astype(int)
-        inside = (at >= 0).all(axis=1) & (at < [ids.shape[1], ids.shape[0]]).all(axis=1)
-        assert near[at[inside, 1], at[inside, 0]].max(initial=0) <= 1.0, (name, line.kind)
+    model = shipped(name)
+    # half the pixels each way: the same view, drawn coarser
+    camera = PinholeCamera.from_field_of_view(
+        model.camera.width // 2, model.camera.height // 2, 2 * math.degrees(math.atan(0.5 * model.camera.width / model.camera.fx))
+    )
+    found = agreement(replace(model, camera=camera))
+    assert found.border_px <= 1.0 and found.line_px <= 1.0, found
 
 
 def test_a_box_shows_nine_edges_and_hides_three():
@@ -132,7 +76,7 @@ def test_edges_through_the_camera_plane_are_cut_and_those_behind_are_left_out():
 
 
 def test_the_svg_is_well_formed_and_the_same_each_time(tmp_path):
-    model = read_model(presets_folder() / "scenes" / "workshop.toml")
+    model = shipped("workshop")
     drawing = draw(model, model.camera, model.world_from_camera, hidden=True)
     write_svg(tmp_path / "a.svg", drawing, "a < b & c")
     root = ElementTree.parse(tmp_path / "a.svg").getroot()

@@ -7,6 +7,9 @@ import tempfile
 from pathlib import Path
 
 from rangecheck.studies.pictures_killed import killed_dataset_part, kills_part
+from rangecheck.studies.pictures_known import maps_part
+from rangecheck.studies.pictures_lines import drawings_part
+from rangecheck.studies.pictures_optics import cameras_part
 from rangecheck.studies.whole_commands import command, sample_mesh
 from rangecheck.study import Part, study_of_parts
 
@@ -66,8 +69,16 @@ def _dataset_part(quick: bool) -> Part:
     return Part(findings=[finding], tables={"dataset": [row]})
 
 
-_PARTS = {"turntable": _turntable_part, "kills": kills_part, "killed-dataset": killed_dataset_part, "dataset": _dataset_part}
+_PARTS = {
+    "turntable": _turntable_part,
+    "dataset": _dataset_part,
+    "kills": kills_part,
+    "killed-dataset": killed_dataset_part,
+    "maps": maps_part,
+    "cameras": cameras_part,
+    "drawings": drawings_part,
+}
 PARTS = tuple(_PARTS)
 study = study_of_parts(
-    "pictures", "Turntables and data sets: what whole commands cost, and that killing them loses nothing", _PARTS
+    "pictures", "Pictures: what they cost, what killing them loses, and how far maps, cameras and drawings are off", _PARTS
 )
