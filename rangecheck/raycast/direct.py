@@ -13,6 +13,7 @@ import ctypes
 import weakref
 from functools import cache
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numba
@@ -27,6 +28,7 @@ from rangecheck.kernels import inline_kernel, kernel
 _POINTER = ctypes.c_void_p
 _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
     "rtcNewDevice": (_POINTER, [ctypes.c_char_p]),
+    "rtcReleaseDevice": (None, [_POINTER]),
     "rtcGetDeviceProperty": (ctypes.c_ssize_t, [_POINTER, ctypes.c_int]),
     "rtcGetDeviceError": (ctypes.c_int, [_POINTER]),
     "rtcNewScene": (_POINTER, [_POINTER]),
@@ -79,6 +81,10 @@ def load() -> ctypes.CDLL | None:
     return None
 
 
+#: trees are built one at a time: another build must not meet the moment when more threads are allowed
+_building = Lock()
+
+
 @cache
 def _device() -> int:
     library = load()
@@ -109,6 +115,16 @@ def _proved(library: ctypes.CDLL) -> bool:
     return True
 
 
+def _commit(library: ctypes.CDLL, scene: int) -> None:
+    """Build a scene's tree on one thread, and put the engine's helpers to sleep.
+
+    TBB, held to one thread, leaves a helper behind that looks for work for ever and takes a core from the tracing; it goes to sleep once more
+    threads are allowed, which a device does that is made, and may be gone again, after the build."""
+    with _building:
+        library.rtcCommitScene(scene)
+        library.rtcReleaseDevice(library.rtcNewDevice(b"threads=2"))
+
+
 class DirectScene:
     """Triangles (n, 3) float32 local, (m, 3) int32 in one Embree scene."""
 
@@ -127,7 +143,7 @@ class DirectScene:
         library.rtcCommitGeometry(geometry)
         library.rtcAttachGeometry(self._scene, geometry)
         library.rtcReleaseGeometry(geometry)
-        library.rtcCommitScene(self._scene)
+        _commit(library, self._scene)
         weakref.finalize(self, library.rtcReleaseScene, self._scene)
         self._address = {
             name: ctypes.cast(getattr(library, name), _POINTER).value
