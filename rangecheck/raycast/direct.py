@@ -81,8 +81,9 @@ def load() -> ctypes.CDLL | None:
     return None
 
 
-#: trees are built one at a time: another build must not meet the moment when more threads are allowed
+#: trees are built one at a time: none must be built while the device lives that allows more threads
 _building = Lock()
+_awake: list[int] = []
 
 
 @cache
@@ -116,13 +117,15 @@ def _proved(library: ctypes.CDLL) -> bool:
 
 
 def _commit(library: ctypes.CDLL, scene: int) -> None:
-    """Build a scene's tree on one thread, and put the engine's helpers to sleep.
+    """Build a scene's tree on one thread, and let the engine's helpers sleep afterwards.
 
-    TBB, held to one thread, leaves a helper behind that looks for work for ever and takes a core from the tracing; it goes to sleep once more
-    threads are allowed, which a device does that is made, and may be gone again, after the build."""
+    TBB, held to one thread, leaves a helper behind that looks for work for ever and takes a core from the tracing; it goes to sleep where more
+    threads are allowed, as they are while a device lives that may use them."""
     with _building:
+        while _awake:
+            library.rtcReleaseDevice(_awake.pop())
         library.rtcCommitScene(scene)
-        library.rtcReleaseDevice(library.rtcNewDevice(b"threads=2"))
+        _awake.append(library.rtcNewDevice(b"threads=2"))
 
 
 class DirectScene:
