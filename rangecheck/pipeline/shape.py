@@ -65,7 +65,8 @@ def make_solid(surface: Surface, settings: Settings, reporter: Reporter, eye_mm:
             with reporter.stage("hollowing"):
                 shaped = _hollowed(shaped, made, wanted, reporter)
         with reporter.stage("proving"):
-            made.solid = _proved(shaped, settings, reporter)
+            proved = closed.solid if shaped is closed.surface and not settings.checking.severities else None
+            made.solid = proved or _proved(shaped, settings, reporter)
         made.surface, made.verdict = made.solid.surface, made.solid.verdict
     except NotSolid as refusal:
         found = refusal.measured.get("verdict")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import numpy.typing as npt
 
 from rangecheck.arrays import mm_per
 from rangecheck.solid.findings import Finding, Verdict, finding, verdict
-from rangecheck.solid.opinions import Opinion, ask_meshlab, disagreements, opinions_with
+from rangecheck.solid.opinions import Judges, Opinion, disagreements
 from rangecheck.solid.printer import Printer
 from rangecheck.solid.printing import UP, check_printing
 from rangecheck.solid.shape import shape_findings
@@ -40,25 +41,30 @@ def check_mesh_file(
     """Everything that can be found out about a mesh file. `opinions` asks trimesh, MeshLab and manifold3d too; with `printer`, a solid is
     also judged for printing as it stands along `up`. Raises InputError for what cannot be read, UnitMissing where the unit is not said."""
     read = open_mesh(path, unit)
-    # MeshLab thinks in a process of its own while the surface is judged here
-    asked = ask_meshlab(path) if opinions else None
-    judged = check_solid(read.surface, severities=severities, engine=asked is None)
-    found: list[Finding] = list(judged.findings)
-    facts: dict[str, Any] = dict(judged.facts)
-    extra = [note for note in read.notes if "bytes follow" in note]
-    if extra:
-        found.append(finding("trailing-bytes", 1, extra[0], severities=severities))
-    found += shape_findings(read.surface, severities=severities)
+    found: list[Finding] = []
     answers: list[Opinion] = []
-    if asked is not None:
-        answers = opinions_with(asked, path, read.surface)
+    with ExitStack() as stack:
+        # the others think in processes of their own while the surface is judged here
+        judges = stack.enter_context(_asked(path, read)) if opinions else None
+        judged = check_solid(read.surface, severities=severities, engine=judges is None)
+        facts: dict[str, Any] = dict(judged.facts)
+        found += judged.findings
+        found += [finding("trailing-bytes", 1, note, severities=severities) for note in read.notes if "bytes follow" in note]
+        found += shape_findings(read.surface, severities=severities)
+        if judges is not None:
+            answers = judges.answers()
+    if answers:
         found += disagreements(read.surface, answers, mm_per(read.unit), severities)
         facts["opinions"] = [a.to_dict() for a in answers]
-        if facts["closed"] and not answers[-1].closed:
+        if facts["closed"] and answers[-1].closed is False:
             found.append(engine_refuses(answers[-1].facts["status"], severities))
-        facts["engine_asked"] = True
+        facts["engine_asked"] = answers[-1].closed is not None
     if printer is not None and judged.fit:
         printed = check_printing(Solid.from_surface(read.surface), printer, up=up, severities=severities)
         found += printed.findings
         facts["printing"] = dict(printed.facts)
     return FileCheck(verdict(found, facts), read, tuple(answers))
+
+
+def _asked(path: str | Path, read: MeshFile) -> Judges:
+    return Judges(path, read.surface, unit_mm=mm_per(read.unit), records=read.records)

@@ -16,7 +16,7 @@ from rangecheck.errors import SettingError, SurfaceError
 from rangecheck.solid.findings import Verdict
 from rangecheck.solid.relief import close_relief
 from rangecheck.solid.repair import MAX_MOVE_MM, MAX_VANISHED, Step, compared, leash, repair
-from rangecheck.solid.solid import check_solid
+from rangecheck.solid.solid import Solid, check_solid
 from rangecheck.surface.surface import Surface
 from rangecheck.surface.topology import is_closed
 
@@ -37,6 +37,7 @@ class Closed:
     moved_mm      farthest way between what was given and what is left of it, outside filled faces
     vanished      share of the given area that is gone
     before, after verdicts
+    solid         the surface as it was proved, where that was done on the way
     """
 
     surface: Surface
@@ -48,6 +49,7 @@ class Closed:
     vanished: float
     before: Verdict = field(repr=False)
     after: Verdict = field(repr=False)
+    solid: Solid | None = field(default=None, repr=False)
 
     def table(self) -> list[tuple[str, Any, Any]]:
         """Rows (what, original, final)."""
@@ -116,10 +118,11 @@ def choose_way(surface: Surface, *, one_scan: bool = False) -> tuple[str, str]:
 
 
 def _as_relief(surface: Surface, back_mm: float, eye_mm: npt.ArrayLike | None, reason: str) -> Closed:
-    before = check_solid(surface, engine=False)
+    # it is open, and only faces that lie side by side as seen from the eye are kept: where it runs through itself need not be asked
+    before = check_solid(surface, intersections=False, engine=False)
     made = close_relief(surface, back_mm=back_mm, eye_mm=eye_mm)
     moved, vanished = leash(surface, made.surface)
     steps = tuple(
         Step("close-relief", 1, note) for note in (*made.notes, f"skirt and back plane {back_mm:g} mm behind its deepest point")
     )
-    return Closed(made.surface, "relief", reason, steps, (), moved, vanished, before, made.verdict)
+    return Closed(made.surface, "relief", reason, steps, (), moved, vanished, before, made.verdict, made)

@@ -1,9 +1,10 @@
-"""Second opinions on the same bytes: trimesh, MeshLab and manifold3d, each by its own reader and rules, and why they differ.
+"""Second opinions on the same bytes: trimesh, MeshLab and manifold3d, each by its own rules, and why they differ.
 
 Rules: rangecheck welds corners whose float32 bits are equal. trimesh merges vertices equal to 8 decimals of the file's unit, drops
 faces that closes, and calls a mesh watertight when each edge has two faces, whichever way they run. MeshLab merges equal vertices.
-manifold3d takes the welded mesh and asks for two opposite half-edges everywhere. MeshLab runs in a process of its own, so that its
-crash is an answer and not ours.
+manifold3d takes the welded mesh and asks for two opposite half-edges everywhere. Each is asked in a process of its own (judges.py), two
+at a time, while the caller goes on. Files are read by trimesh's and MeshLab's own readers, but for binary STL: its records of three
+float32 corners leave nothing to interpret, so these are handed over with equal corners welded, as both programs would weld them.
 """
 
 from __future__ import annotations
@@ -12,15 +13,18 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import numpy as np
 
-from rangecheck.errors import NotSolid
-from rangecheck.solid.engine import to_engine
+from rangecheck.arrays import FloatArray
+from rangecheck.solid import judges
 from rangecheck.solid.findings import Finding, finding
 from rangecheck.surface import topology as topo
 from rangecheck.surface.surface import Surface
@@ -29,22 +33,8 @@ from rangecheck.surface.weld import weld_exactly
 #: decimals to which trimesh merges vertices, in the file's unit
 TRIMESH_DECIMALS = 8
 TIMEOUT_S = 120
-Asked = subprocess.Popen[str]
-
-_MESHLAB = """
-import json, sys
-import pymeshlab
-meshes = pymeshlab.MeshSet(verbose=False)
-meshes.load_new_mesh(sys.argv[1])
-meshes.meshing_remove_duplicate_vertices()
-facts = meshes.get_topological_measures()
-kept = ("boundary_edges", "non_two_manifold_edges", "non_two_manifold_vertices", "connected_components_number", "is_mesh_two_manifold")
-answer = {name: int(facts[name]) for name in kept}
-if sys.argv[2] == "1":
-    meshes.compute_selection_by_self_intersections_per_face()
-    answer["self_intersecting_faces"] = int(meshes.current_mesh().selected_face_number())
-print(json.dumps(answer))
-"""
+#: programs that think at the same time, beside the caller
+TOGETHER = 2
 
 
 @dataclass(frozen=True)
@@ -61,69 +51,86 @@ class Opinion:
         return {"program": self.program, "closed": self.closed, "facts": dict(self.facts), "error": self.error}
 
 
-def second_opinions(path: str | Path, surface: Surface, *, intersections: bool = True) -> list[Opinion]:
-    """Our opinion of `surface`, which was read from `path`, then those of trimesh, MeshLab and manifold3d."""
-    return opinions_with(ask_meshlab(path, intersections=intersections), path, surface)
+class Judges:
+    """trimesh, MeshLab and manifold3d, asked and thinking. `answers` waits for them; leaving the context ends whoever still thinks."""
+
+    def __init__(
+        self, path: str | Path, surface: Surface, *, unit_mm: float = 1.0, records: bool = False, intersections: bool = True
+    ) -> None:
+        """Asks about `surface`, which was read from `path` in units of `unit_mm`; `records` says that the file is binary STL."""
+        self._own = Opinion(
+            "rangecheck", topo.is_closed(surface), {"vertices": len(surface.vertices), "faces": len(surface.faces)}
+        )
+        self._folder = tempfile.TemporaryDirectory()
+        self._running: list[subprocess.Popen[str]] = []
+        self._pool = ThreadPoolExecutor(TOGETHER)
+        welded = _saved(Path(self._folder.name) / "welded", surface, surface.vertices)
+        # a product of float32 by a unit, and back: rounding to float32 gives the bits of the file again
+        given = (
+            _saved(Path(self._folder.name) / "records", surface, (surface.vertices / unit_mm).astype(np.float32))
+            if records
+            else Path(path)
+        )
+        meshlab = self._pool.submit(self._ask, "MeshLab", given, intersections)
+        others = [self._pool.submit(self._ask, who, source) for who, source in (("trimesh", given), ("manifold3d", welded))]
+        self._answers: list[Future[Opinion]] = [others[0], meshlab, others[1]]
+
+    def _ask(self, program: str, source: Path, intersections: bool = False) -> Opinion:
+        process = begin(program, source, intersections=intersections)
+        self._running.append(process)
+        return answer(program, process)
+
+    def answers(self) -> list[Opinion]:
+        """Our opinion, then those of trimesh, MeshLab and manifold3d."""
+        return [self._own, *(later.result() for later in self._answers)]
+
+    def __enter__(self) -> Judges:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        for process in self._running:
+            if process.poll() is None:
+                process.kill()
+        self._pool.shutdown()
+        self._folder.cleanup()
 
 
-def opinions_with(meshlab: Asked, path: str | Path, surface: Surface) -> list[Opinion]:
-    """As `second_opinions`, where MeshLab was asked before and had time to think."""
-    ours = Opinion("rangecheck", topo.is_closed(surface), {"vertices": len(surface.vertices), "faces": len(surface.faces)})
-    opinions = [ours, trimesh_opinion(path), manifold_opinion(surface)]
-    return [*opinions[:2], meshlab_answer(meshlab), opinions[2]]
+def second_opinions(path: str | Path, surface: Surface, *, records: bool = False, intersections: bool = True) -> list[Opinion]:
+    """Our opinion of `surface` in mm, which was read from `path`, then those of trimesh, MeshLab and manifold3d."""
+    with Judges(path, surface, records=records, intersections=intersections) as judges:
+        return judges.answers()
 
 
-def trimesh_opinion(path: str | Path) -> Opinion:
-    """What trimesh makes of the file."""
-    try:
-        import trimesh
-    except ImportError:
-        return Opinion("trimesh", None, error="not installed; pip install trimesh")
-    try:
-        mesh = trimesh.load_mesh(path)
-        if not len(mesh.faces):
-            return Opinion("trimesh", None, error="found no faces")
-        facts = {
-            "vertices": len(mesh.vertices),
-            "faces": len(mesh.faces),
-            "winding_consistent": bool(mesh.is_winding_consistent),
-            "volume": float(mesh.volume) if mesh.is_watertight else None,
-        }
-        return Opinion("trimesh", bool(mesh.is_watertight), facts)
-    except Exception as error:  # a foreign reader may raise anything
-        return Opinion("trimesh", None, error=f"{type(error).__name__}: {error}"[:200])
+def _saved(folder: Path, surface: Surface, vertices: FloatArray) -> Path:
+    folder.mkdir()
+    np.save(folder / "vertices.npy", vertices)
+    np.save(folder / "faces.npy", surface.faces)
+    return folder
 
 
-def ask_meshlab(path: str | Path, *, intersections: bool = True) -> Asked:
-    """MeshLab's process, begun on the file."""
-    command = [sys.executable, "-c", _MESHLAB, str(Path(path).resolve()), "1" if intersections else "0"]
+def begin(program: str, source: str | Path, *, intersections: bool = False) -> subprocess.Popen[str]:
+    """One program's process, begun on a mesh file or a folder of arrays (see judges.py)."""
+    command = [sys.executable, "-P", judges.__file__, program, str(Path(source).resolve())]
     quiet = {**os.environ, "QT_QPA_PLATFORM": "offscreen"}
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=quiet)
+    return subprocess.Popen(
+        command + ["intersections"] * intersections, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=quiet
+    )
 
 
-def meshlab_answer(process: Asked) -> Opinion:
-    """What MeshLab says, when it is done."""
+def answer(program: str, process: subprocess.Popen[str]) -> Opinion:
+    """What the program says, when it is done."""
     try:
         out, errors = process.communicate(timeout=TIMEOUT_S)
     except subprocess.TimeoutExpired:
         process.kill()
         process.communicate()
-        return Opinion("MeshLab", None, error=f"gave no answer in {TIMEOUT_S} s")
+        return Opinion(program, None, error=f"gave no answer in {TIMEOUT_S} s")
     if process.returncode != 0:
         last = errors.strip().splitlines()[-1:] or [f"ended with status {process.returncode}"]
-        return Opinion("MeshLab", None, error=last[0][:200])
-    facts = json.loads(out.strip().splitlines()[-1])
-    closed = facts["boundary_edges"] == 0 and facts["non_two_manifold_edges"] == 0
-    return Opinion("MeshLab", closed, facts)
-
-
-def manifold_opinion(surface: Surface) -> Opinion:
-    """What manifold3d makes of the welded surface."""
-    try:
-        solid, _ = to_engine(surface)
-    except NotSolid as refusal:
-        return Opinion("manifold3d", False, {"status": refusal.measured["word"]})
-    return Opinion("manifold3d", True, {"status": "NoError", "volume_mm3": float(solid.volume()), "genus": int(solid.genus())})
+        return Opinion(program, None, error=last[0][:200])
+    said = json.loads(out.strip().splitlines()[-1])
+    return Opinion(program, said.get("closed"), said.get("facts", {}), said.get("error"))
 
 
 def disagreements(

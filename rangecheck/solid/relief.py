@@ -10,6 +10,7 @@ measured face moves. The result is proved like any other `Solid`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -68,14 +69,21 @@ def view_of(surface: Surface, eye_mm: npt.ArrayLike | None = None) -> View:
         eye = surface.bounds_mm.mean(axis=0)
     else:
         eye = require("eye_mm", eye_mm, (3,), finite=True)
-        forward = surface.vertices[np.unique(surface.faces)].mean(axis=0) - eye
+        forward = surface.vertices[_used(surface.vertices, surface.faces)].mean(axis=0) - eye
         forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, np.eye(3)[np.argmin(np.abs(forward))])
     right /= np.linalg.norm(right)
     depth = (surface.vertices - eye) @ forward
-    if eye_mm is not None and depth[np.unique(surface.faces)].min() <= 0:
+    if eye_mm is not None and depth[_used(surface.vertices, surface.faces)].min() <= 0:
         raise SurfaceError("part of the surface lies behind the eye; give the place that the scan was taken from")
     return View(eye, right, np.cross(right, forward), forward, None if eye_mm is None else float(np.median(depth)))
+
+
+def _used(points: FloatArray, faces: IntArray) -> BoolArray:
+    """(n,) whether a face names a point."""
+    used = np.zeros(len(points), bool)
+    used[faces] = True
+    return used
 
 
 def close_relief(
@@ -105,8 +113,9 @@ def close_relief(
     kept = _visible(surface, uv, depth, notes)
     kept = _without_islands(surface, kept, uv, island_share, notes)
     typical = float(np.median(np.linalg.norm(uv[surface.faces[kept][:, 1]] - uv[surface.faces[kept][:, 0]], axis=1)))
-    gap = _gap_that_joins(uv, surface.faces[kept], GAP_EDGES * typical, notes) if gap_mm is None else gap_mm
-    kept, filling = _one_disc(uv, surface.faces, kept, gap, notes)
+    rest = outside_of(uv, surface.faces[kept])
+    gap = _gap_that_joins(uv, surface.faces[kept], rest, GAP_EDGES * typical, notes) if gap_mm is None else gap_mm
+    kept, filling = _one_disc(uv, surface.faces, kept, rest, gap, notes)
     uv, depth, front, fill_count = _with_filling(uv, depth, surface.faces[kept], filling)
     closed = _with_skirt(surface, view, uv, depth, front, kept, back_mm)
     filled = float(closed.face_areas[len(kept) : len(kept) + fill_count].sum())
@@ -172,10 +181,12 @@ def _without_islands(surface: Surface, kept: IntArray, uv: FloatArray, share: fl
     return kept[~small[shell]]
 
 
-def _one_disc(uv: FloatArray, faces: IntArray, kept: IntArray, gap_mm: float, notes: list[str]) -> tuple[IntArray, IntArray]:
+def _one_disc(
+    uv: FloatArray, faces: IntArray, kept: IntArray, rest: Outside, gap_mm: float, notes: list[str]
+) -> tuple[IntArray, IntArray]:
     """The faces kept and the filling (k, 3) over existing vertices that together have one rim and no tunnel."""
     for _ in range(30):
-        filling = _filling(uv, faces[kept], gap_mm)
+        filling = _filling(len(uv), rest, gap_mm)
         whole = np.concatenate([faces[kept], filling])
         flat = _flat_surface(uv, whole)
         count, shell = topo.shells(flat)
@@ -190,6 +201,7 @@ def _one_disc(uv: FloatArray, faces: IntArray, kept: IntArray, gap_mm: float, no
         if not doomed[: len(kept)].any():
             return kept, filling[~doomed[len(kept) :]]
         kept = kept[~doomed[: len(kept)]]
+        rest = outside_of(uv, faces[kept])
     raise SurfaceError("the rim of the relief touches itself in too many points; smooth or fill the scan first")
 
 
@@ -206,22 +218,22 @@ def _smaller_fans(flat: Surface, areas: FloatArray) -> BoolArray:
     return doomed
 
 
-def _gap_that_joins(uv: FloatArray, faces: IntArray, least_mm: float, notes: list[str]) -> float:
+def _gap_that_joins(uv: FloatArray, faces: IntArray, rest: Outside, least_mm: float, notes: list[str]) -> float:
     """The narrowest gap, at least `least_mm`, whose bridging makes one piece of all; `least_mm` when that is too wide."""
-    count, shell = topo.shells(_flat_surface(uv, faces))
+    count, shell = rest.shells
     if count == 1:
         return least_mm
     piece = np.full(len(uv) + 4, -1)
     piece[faces] = shell[:, None]
-    between, longest = _outside(uv, faces)
-    pieces = piece[between]
+    longest = rest.longest_mm
+    pieces = piece[rest.triangles]
     joins = (pieces >= 0).all(axis=1) & (pieces != pieces[:, :1]).any(axis=1)
     group = np.arange(count)
     for triangle in np.flatnonzero(joins)[np.argsort(longest[joins], kind="stable")]:
         met = np.unique(group[pieces[triangle]])
         group[np.isin(group, met)] = met[0]
         if (group == group[0]).all():
-            widest = GAP_SHARE * float(np.ptp(uv[faces].reshape(-1, 2), axis=0).max())
+            widest = GAP_SHARE * rest.extent_mm
             narrowest = float(longest[triangle])
             # a bridge over the narrowest place alone would be a thread
             needed = min(BRIDGE * narrowest, widest)
@@ -234,22 +246,35 @@ def _gap_that_joins(uv: FloatArray, faces: IntArray, least_mm: float, notes: lis
     return least_mm
 
 
-def _filling(uv: FloatArray, faces: IntArray, gap_mm: float) -> IntArray:
-    """Triangles over the rims of `faces` that fill all holes and the outer gaps narrower than `gap_mm`."""
-    outside, longest = _outside(uv, faces)
-    wide = (outside >= len(uv)).any(axis=1) | (longest > gap_mm)
+def _filling(vertex_count: int, rest: Outside, gap_mm: float) -> IntArray:
+    """Triangles that fill all holes and the outer gaps narrower than `gap_mm`."""
+    outside = rest.triangles
+    framed = (outside >= vertex_count).any(axis=1)
     # what is wide stays open only where it can be reached from the frame through wide triangles
-    across = neighbours_of(outside, len(uv) + 4)
-    return outside[~_reached((outside >= len(uv)).any(axis=1), wide, across)]
+    across = neighbours_of(outside, vertex_count + 4)
+    return outside[~_reached(framed, framed | (rest.longest_mm > gap_mm), across)]
 
 
-def _outside(uv: FloatArray, faces: IntArray) -> tuple[IntArray, FloatArray]:
-    """Triangles (k, 3) over the rims of `faces` and the four corners of a frame around them (numbered last), and the longest side of each."""
-    low, high = uv[faces].reshape(-1, 2).min(axis=0), uv[faces].reshape(-1, 2).max(axis=0)
-    margin = (high - low).max()
-    (x0, y0), (x1, y1) = low - margin, high + margin
+class Outside(NamedTuple):
+    """What lies beside a plane mesh: triangles (k, 3) over its rims and the four corners of a frame around it (numbered last), the longest
+    side of each, the mesh's shells (number, and that of each face), and its extent."""
+
+    triangles: IntArray
+    longest_mm: FloatArray
+    shells: tuple[int, IntArray]
+    extent_mm: float
+
+
+def outside_of(uv: FloatArray, faces: IntArray) -> Outside:
+    """What lies beside the faces (m, 3) of points (n, 2), which lie side by side."""
+    flat = _flat_surface(uv, faces)
+    used = uv[_used(uv, faces)]
+    low = np.array([column.min() for column in used.T])
+    high = np.array([column.max() for column in used.T])
+    extent = float((high - low).max())
+    (x0, y0), (x1, y1) = low - extent, high + extent
     frame = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
-    rings = [r[::-1] for r in topo.boundary_loops(_flat_surface(uv, faces))]
+    rings = [r[::-1] for r in topo.boundary_loops(flat)]
     vertex = np.concatenate([np.arange(len(uv), len(uv) + 4), *rings])
     points = np.concatenate([uv, frame])
     outside = vertex[triangulate([frame, *(uv[r] for r in rings)])].astype(np.int32)
@@ -257,7 +282,8 @@ def _outside(uv: FloatArray, faces: IntArray) -> tuple[IntArray, FloatArray]:
     across = neighbours_of(outside, len(points))
     turn_diagonals(points, outside, across, np.zeros(len(outside), np.bool_))
     corners = points[outside]
-    return outside, np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2).max(axis=1)
+    sides = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
+    return Outside(outside, sides.max(axis=1), topo.shells(flat), extent)
 
 
 @kernel
@@ -289,8 +315,9 @@ def _with_filling(
     plate = smooth_values(points, heights, free, whole, plate=True)[:, 0]
     count, shell = topo.shells(_flat_surface(points, fine))
     result = membrane.copy()
-    for hole in range(count):
-        own = np.unique(fine[shell == hole])
+    order = np.argsort(shell, kind="stable")
+    for own_faces in np.split(fine[order], np.searchsorted(shell[order], np.arange(1, count))):
+        own = np.unique(own_faces)
         rim, inner = own[own < n], own[own >= n]
         if not len(inner):
             continue
@@ -312,7 +339,7 @@ def _with_skirt(
     rim = loops[0]
     n, k = len(uv), len(rim)
     vertices = np.concatenate([surface.vertices, view.lift(uv[len(surface.vertices) :], depth[len(surface.vertices) :])])
-    deepest = float(depth[np.unique(front)].max())
+    deepest = float(depth[_used(depth, front)].max())
     ring = view.lift(uv[rim], np.full(k, deepest + 0.1 * back_mm))
     rings = [ring, ring + 0.9 * back_mm * view.forward] if view.scale is not None else [ring + 0.9 * back_mm * view.forward]
     faces = [front]
@@ -332,5 +359,6 @@ def _with_skirt(
     )
     origin = np.concatenate([surface.origin_of_face[kept], np.full(len(part) - len(kept), INVENTED)])
     vertices, all_faces = np.concatenate([vertices, *rings]), np.concatenate(faces)
-    used, place = np.unique(all_faces, return_inverse=True)
-    return Surface(vertices[used], place.reshape(-1, 3), part, origin, names)
+    used = _used(vertices, all_faces)
+    place = np.cumsum(used, dtype=np.int32) - 1
+    return Surface(vertices[used], place[all_faces], part, origin, names)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from rangecheck.arrays import IntArray
+from rangecheck.arrays import FloatArray, IntArray
 from rangecheck.errors import NotSolid, SettingError
 from rangecheck.solid.checks import NOISE_SHARE
 from rangecheck.solid.containment import shell_volumes_mm3
@@ -25,6 +25,7 @@ from rangecheck.surface import topology as topo
 from rangecheck.surface.distance import SurfaceDistance
 from rangecheck.surface.intersections import CROSSING, OVERLAP, self_intersections
 from rangecheck.surface.surface import INVENTED, Surface
+from rangecheck.surface.weld import weld_exactly
 
 #: farthest that a point of the surface may move
 MAX_MOVE_MM = 0.05
@@ -294,7 +295,18 @@ def leash(given: Surface, mended: Surface) -> tuple[float, float]:
     if not len(mended.faces) or not len(given.faces):
         return 0.0, 1.0
     own = mended.origin_of_face != INVENTED
-    kept = np.unique(mended.faces[own]) if own.any() else np.empty(0, np.int64)
-    moved = float(SurfaceDistance(given).distance_mm(mended.vertices[kept])[0].max(initial=0.0))
+    kept = np.zeros(len(mended.vertices), bool)
+    kept[mended.faces[own]] = True
+    asked = _elsewhere(mended.vertices[kept], given)
+    moved = float(SurfaceDistance(given).distance_mm(asked)[0].max(initial=0.0)) if len(asked) else 0.0
     area = float(mended.face_areas[own].sum()) if (given.origin_of_face != INVENTED).all() else mended.area_mm2
     return moved, max(0.0, 1.0 - area / given.area_mm2)
+
+
+def _elsewhere(points: FloatArray, surface: Surface) -> FloatArray:
+    """The points that are not, bit for bit, a vertex that a face of the surface names: those lie on it."""
+    used = np.zeros(len(surface.vertices), bool)
+    used[surface.faces] = True
+    known = surface.vertices[used]
+    _, number = weld_exactly(np.concatenate([known, points]))
+    return points[number[len(known) :] > number[: len(known)].max(initial=-1)]

@@ -16,14 +16,15 @@ from typing import NamedTuple
 import numpy as np
 
 from rangecheck.arrays import IntArray
-from rangecheck.kernels import in_chunks, kernel
-from rangecheck.surface.predicates import side_of_line, side_of_plane
+from rangecheck.kernels import in_chunks, inline_kernel, kernel
+from rangecheck.surface.predicates import same_point, side_of_line, side_of_plane
 from rangecheck.surface.surface import Surface
 from rangecheck.surface.tree import triangle_tree
 
 APART, CROSSING, OVERLAP, TOUCHING = 0, 1, 2, 3
 KIND_NAMES = ("apart", "crossing", "overlap", "touching")
-_LEAVES_PER_TASK = 4096
+#: level of the tree whose nodes are tasks of their own
+_TASK_LEVEL = 8
 
 
 class Intersections(NamedTuple):
@@ -53,15 +54,17 @@ def self_intersections(surface: Surface) -> Intersections:
 
     flat = np.concatenate(in_chunks(lambda first, last: flat_faces(tree.corners[first:last]), len(tree.order), 1 << 16))
 
-    def search(first: int, last: int) -> IntArray:
+    level = min(_TASK_LEVEL, tree.depth)
+
+    def search(node: int, _: int) -> IntArray:
         found = np.empty((256, 3), np.int32)
-        count = pairs_that_meet(tree.corners, flat, tree.boxes, tree.depth, first, last, found)
+        count = pairs_that_meet(tree.corners, flat, tree.boxes, tree.depth, level, node, found)
         if count > len(found):
             found = np.empty((count, 3), np.int32)
-            pairs_that_meet(tree.corners, flat, tree.boxes, tree.depth, first, last, found)
+            pairs_that_meet(tree.corners, flat, tree.boxes, tree.depth, level, node, found)
         return found[:count]
 
-    found = np.concatenate(in_chunks(search, 1 << tree.depth, _LEAVES_PER_TASK))
+    found = np.concatenate(in_chunks(search, 1 << level, 1))
     pairs = np.sort(tree.order[found[:, :2]], axis=1)
     ascending = np.lexsort((pairs[:, 1], pairs[:, 0]))
     return Intersections(pairs[ascending], found[ascending, 2].astype(np.uint8))
@@ -73,20 +76,19 @@ def _triangle(corners, i):
     return ((t[0], t[1], t[2]), (t[3], t[4], t[5]), (t[6], t[7], t[8]))
 
 
-@kernel
-def _boxes_apart(t, u):
-    """Whether the boxes around triangles t and u (9,) have no point in common."""
-    for axis in range(3):
-        if max(t[axis], t[3 + axis], t[6 + axis]) < min(u[axis], u[3 + axis], u[6 + axis]):
-            return True
-        if max(u[axis], u[3 + axis], u[6 + axis]) < min(t[axis], t[3 + axis], t[6 + axis]):
-            return True
-    return False
+@inline_kernel
+def _box_of(t):
+    """Low and high corner of the box around a triangle (9,)."""
+    return (
+        min(t[0], t[3], t[6]), min(t[1], t[4], t[7]), min(t[2], t[5], t[8]),
+        max(t[0], t[3], t[6]), max(t[1], t[4], t[7]), max(t[2], t[5], t[8]),
+    )  # fmt: skip
 
 
-@kernel
-def _same(p, q):
-    return p[0] == q[0] and p[1] == q[1] and p[2] == q[2]
+@inline_kernel
+def _apart(p, q):
+    """Whether two boxes have no point in common."""
+    return p[0] > q[3] or q[0] > p[3] or p[1] > q[4] or q[1] > p[4] or p[2] > q[5] or q[2] > p[5]
 
 
 @kernel
@@ -148,7 +150,7 @@ def meeting(t, u):
     shared, t_sum, u_sum = 0, 0, 0
     for i in range(3):
         for j in range(3):
-            if _same(t[i], u[j]):
+            if same_point(t[i], u[j]):
                 shared, t_sum, u_sum = shared + 1, t_sum + i, u_sum + j
     if shared == 3:
         return OVERLAP
@@ -159,21 +161,17 @@ def meeting(t, u):
             return APART
         p, q, axis = t[(i + 1) % 3], t[(i + 2) % 3], _flat_axis(t)
         return OVERLAP if _projected_side(p, q, t[i], axis) == _projected_side(p, q, far, axis) else APART
-    ua, ub, uc = (
-        side_of_plane(t[0], t[1], t[2], u[0]),
-        side_of_plane(t[0], t[1], t[2], u[1]),
-        side_of_plane(t[0], t[1], t[2], u[2]),
-    )
+    ua = side_of_plane(t[0], t[1], t[2], u[0])
+    ub = side_of_plane(t[0], t[1], t[2], u[1])
+    uc = side_of_plane(t[0], t[1], t[2], u[2])
     # the signs of all corners that are not shared agree: no point in common but the shared one
     if abs(ua + ub + uc) == 3 - shared:
         return APART
     if ua == 0 and ub == 0 and uc == 0:
         return _coplanar_meeting(t, u, shared)
-    ta, tb, tc = (
-        side_of_plane(u[0], u[1], u[2], t[0]),
-        side_of_plane(u[0], u[1], u[2], t[1]),
-        side_of_plane(u[0], u[1], u[2], t[2]),
-    )
+    ta = side_of_plane(u[0], u[1], u[2], t[0])
+    tb = side_of_plane(u[0], u[1], u[2], t[1])
+    tc = side_of_plane(u[0], u[1], u[2], t[2])
     if abs(ta + tb + tc) == 3 - shared:
         return APART
     i, t_side = _lone_corner(ta, tb, tc)
@@ -211,47 +209,48 @@ def flat_faces(corners):
 
 
 @kernel
-def pairs_that_meet(corners, flat, boxes, depth, first, last, found):
-    """Pairs (i, j, kind) of places in the tree with i in the leaves first:last and j > i. Returns their number; those beyond
-    the length of `found` are counted but not kept."""
-    n = len(corners)
+def pairs_that_meet(corners, flat, boxes, depth, level, task, found):
+    """Pairs (i, j, kind) of places in the tree, i < j, of which i lies below the node numbered `task` of `level`. Returns their number;
+    those beyond the length of `found` are counted but not kept.
+
+    Two nodes of one level are opened together where their boxes meet, so that a pair of faces is reached once, and far pairs never."""
     leaf_level = (1 << depth) - 1
-    waiting = np.empty(depth + 2, np.int64)
+    first = (1 << level) - 1
+    waiting = np.empty((4 * (depth + 1), 2), np.int64)
     count = 0
-    for leaf in range(first, last):
-        own = leaf_level + leaf
-        start, stop = (leaf * n) >> depth, ((leaf + 1) * n) >> depth
-        x0, y0, z0, x1, y1, z1 = boxes[own]
-        waiting[0] = 0
+    for start in range(first + task, 2 * first + 1):
+        waiting[0, 0], waiting[0, 1] = first + task, start
         top = 1
         while top > 0:
             top -= 1
-            node = waiting[top]
-            box = boxes[node]
-            if box[0] > x1 or box[3] < x0 or box[1] > y1 or box[4] < y0 or box[2] > z1 or box[5] < z0:
+            a, b = waiting[top, 0], waiting[top, 1]
+            if a != b and _apart(boxes[a], boxes[b]):
                 continue
-            if node < leaf_level:
-                # the last leaf below a node: pairs with earlier leaves were found from there
-                right = 2 * node + 2
-                while right < leaf_level:
-                    right = 2 * right + 2
-                if right >= own:
-                    waiting[top] = 2 * node + 2
-                    waiting[top + 1] = 2 * node + 1
-                    top += 2
+            if a >= leaf_level:
+                count = _meetings_of_leaves(corners, flat, boxes[b], depth, a - leaf_level, b - leaf_level, found, count)
                 continue
-            if node < own:
+            for k in range(4):
+                if a != b or k != 2:
+                    waiting[top, 0], waiting[top, 1] = 2 * a + 1 + k // 2, 2 * b + 1 + k % 2
+                    top += 1
+    return count
+
+
+@kernel
+def _meetings_of_leaves(corners, flat, box, depth, a, b, found, count):
+    """Adds the pairs of faces of leaves a <= b to `found`, of which `count` are known; `box` is that of leaf b. Returns their number."""
+    n = len(corners)
+    start, stop = (b * n) >> depth, ((b + 1) * n) >> depth
+    for i in range((a * n) >> depth, ((a + 1) * n) >> depth):
+        own = _box_of(corners[i])
+        if flat[i] or _apart(own, box):
+            continue
+        for j in range(max(i + 1, start), stop):
+            if flat[j] or _apart(own, _box_of(corners[j])):
                 continue
-            other = node - leaf_level
-            for i in range(start, stop):
-                if flat[i]:
-                    continue
-                for j in range(max(i + 1, (other * n) >> depth), ((other + 1) * n) >> depth):
-                    if flat[j] or _boxes_apart(corners[i], corners[j]):
-                        continue
-                    kind = meeting(_triangle(corners, i), _triangle(corners, j))
-                    if kind != APART:
-                        if count < len(found):
-                            found[count, 0], found[count, 1], found[count, 2] = i, j, kind
-                        count += 1
+            kind = meeting(_triangle(corners, i), _triangle(corners, j))
+            if kind != APART:
+                if count < len(found):
+                    found[count, 0], found[count, 1], found[count, 2] = i, j, kind
+                count += 1
     return count

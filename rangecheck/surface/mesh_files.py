@@ -27,12 +27,14 @@ _UNITS_3MF = {"micron": "um", "millimeter": "mm", "centimeter": "cm", "meter": "
 
 @dataclass(frozen=True)
 class MeshFile:
-    """A mesh file that was read: its surface in mm, its format and unit, and what was odd about it, in sentences."""
+    """A mesh file that was read: its surface in mm, its format and unit, what was odd about it, in sentences, and whether it is
+    binary STL, whose records of float32 corners leave nothing to interpret."""
 
     surface: Surface
     format: str
     unit: str
     notes: tuple[str, ...]
+    records: bool = False
 
 
 def read_mesh(path: str | Path, unit: str | None = None) -> Surface:
@@ -46,10 +48,11 @@ def open_mesh(path: str | Path, unit: str | None = None) -> MeshFile:
     content = read_bytes(path)
     kind = _format(path, content)
     notes: list[str] = []
+    records = False
     vertices: FloatArray
     faces: IntArray
     if kind == "stl":
-        corners, notes = stl_corners(path, content)
+        corners, notes, records = stl_corners(path, content)
         _finite(path, corners.reshape(-1, 3), 3)
         first, number = weld_exactly(corners.reshape(-1, 3))
         vertices, faces = corners.reshape(-1, 3)[first].astype(np.float64), number.reshape(-1, 3)
@@ -74,7 +77,7 @@ def open_mesh(path: str | Path, unit: str | None = None) -> MeshFile:
         raise UnitMissing(path)
     if kind != "stl":
         vertices, faces = _welded(vertices, faces, notes)
-    return MeshFile(Surface(vertices * mm_per(unit), faces, part_names=(path.stem,)), kind, unit, tuple(notes))
+    return MeshFile(Surface(vertices * mm_per(unit), faces, part_names=(path.stem,)), kind, unit, tuple(notes), records)
 
 
 def _format(path: Path, content: bytes) -> str:

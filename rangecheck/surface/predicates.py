@@ -58,6 +58,12 @@ def _minor(a, ae, b, be, c, ce, d, de):
 
 
 @kernel
+def same_point(p, q):
+    """Whether two points have equal coordinates."""
+    return p[0] == q[0] and p[1] == q[1] and p[2] == q[2]
+
+
+@kernel
 def side_of_plane(a, b, c, d):
     """Sign of det(b - a, c - a, d - a): 1 where d lies on the side from which a, b, c run counter-clockwise, 0 on the plane."""
     bx, by, bz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
@@ -70,7 +76,8 @@ def side_of_plane(a, b, c, d):
         return 1
     if determinant < -_ERROR_3D * terms:
         return -1
-    if terms == 0.0:
+    # neighbours share corners, which then are asked about most: what is the same point needs no second look
+    if terms == 0.0 or same_point(b, d) or same_point(c, d):
         return 0
     return _side_of_plane_in_pairs(a, b, c, d, terms)
 
@@ -109,7 +116,7 @@ def side_of_line(ax, ay, bx, by, cx, cy):
         return 1
     if determinant < -_ERROR_2D * terms:
         return -1
-    if terms == 0.0:
+    if terms == 0.0 or (bx == cx and by == cy):
         return 0
     ux, ue = _difference(bx, ax)
     uy, uf = _difference(by, ay)

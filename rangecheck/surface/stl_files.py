@@ -20,18 +20,18 @@ _NUMBER = rb"([^\s]+)"
 _VERTEX = re.compile(rb"vertex\s+" + _NUMBER + rb"\s+" + _NUMBER + rb"\s+" + _NUMBER, re.IGNORECASE)
 
 
-def stl_corners(path: Path, content: bytes) -> tuple[FloatArray, list[str]]:
-    """(m, 3, 3) float32 corners of an STL file's faces, and what was odd about it. Raises InputError."""
+def stl_corners(path: Path, content: bytes) -> tuple[FloatArray, list[str], bool]:
+    """(m, 3, 3) float32 corners of an STL file's faces, what was odd about it, and whether it is binary. Raises InputError."""
     looks_ascii = content[:512].lstrip()[:5].lower() == b"solid" and b"facet" in content[:4096].lower()
     stated = int.from_bytes(content[80:84], "little") if len(content) >= _HEADER else None
     fits = stated is not None and len(content) == _HEADER + _RECORD.itemsize * stated
     if looks_ascii and not fits:
-        return _ascii(path, content)
+        return *_ascii(path, content), False
     if stated is None:
         if content[:512].lstrip()[:5].lower() == b"solid":
             raise InputError(path, "holds no faces; export it again")
         raise InputError(path, f"is {len(content)} bytes long, too short for STL; export it again")
-    return _binary(path, content, stated)
+    return *_binary(path, content, stated), True
 
 
 def _binary(path: Path, content: bytes, stated: int) -> tuple[FloatArray, list[str]]:
