@@ -1,6 +1,7 @@
 """Pictures obey the laws of light: closed forms, no leaks, no bias, and the same bytes however they are computed."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from rangecheck.reflectance import GREY_UM, Material
 from rangecheck.scene import Scene, Source, constant, gradient
 from rangecheck.surface import Surface
 from rangecheck.surface.surface import join
-from rangecheck.transport import DIRECT, Settings, Tracer, image_irradiance
+from rangecheck.transport import DIRECT, Plan, Settings, Tracer, image_irradiance, render
 from rangecheck.transport.camera_rays import pixel_order
 
 WHITE = Material("white", K_lm=0.8, wavelengths_um=GREY_UM)
@@ -277,6 +278,33 @@ def test_open_surfaces_are_lit_from_the_side_that_is_seen():
     assert (Tracer(scene).render(camera, pose, DIRECT).radiance > 0).all()
     camera, pose = looking(8, 8, eye=(0, 300, 100))
     assert (Tracer(scene).render(camera, pose, DIRECT).radiance == 0).all()
+
+
+def test_samples_spent_where_a_picture_is_uneven_do_what_samples_everywhere_would():
+    scene = Scene(
+        join([ball(), floor(y_mm=-50.0)]),
+        (WHITE,),
+        (0, 0),
+        (lamp((200, 300, 200), 20.0),),
+        constant(0.0),
+        smooth_of_part=(True, False),
+    )
+    tracer, pose = Tracer(scene), looking(64, 64, 30, eye=(0, 120, 300))
+    lit = Settings(each=4, uneven=0.15, spike=False, lobe=False, diffuse=False, depth=1, backdrop=False)
+
+    def picture(**other):
+        return render(tracer, *pose, plan=Plan("direct", 0.0, replace(lit, **other), None), seed=3)
+
+    reference = picture(each=256, uneven=0.0).radiance
+    edges, everywhere, single = picture(), picture(uneven=0.0), picture(each=1, uneven=0.0, centre=True)
+
+    def error(film):
+        return float(np.sqrt(np.mean((film.radiance - reference) ** 2)))
+
+    uneven = edges.samples == 4
+    assert (edges.samples[~uneven] == 1).all() and 0.02 < uneven.mean() < 0.3
+    assert error(edges) < 1.1 * error(everywhere) < 0.7 * error(single)
+    assert np.array_equal(edges.radiance, picture().radiance)
 
 
 def test_image_irradiance_falls_off_towards_the_corners():

@@ -104,6 +104,9 @@ class Solidify(Section):
     print_up: tuple[Finite, Finite, Finite] = Field(
         (0.0, 1.0, 0.0), description="away from the build plate: the tilt for which it must drain"
     )
+    file_up: Literal["z", "scan"] = Field(
+        "z", description="z: STL and 3MF stand on z = 0 as slicers take them, and are read here as they were; scan: the frame of the scans, y up"
+    )
     printer: str | None = Field(None, description="a profile of configs/printers, or a profile file, that the part is judged for")
 
 
@@ -152,7 +155,10 @@ class Light(Section):
         description="direct: sources, shadows, mirrors, no interreflection of matt surfaces; plan: as much as the tolerance asks for; "
         "full: the reference; report: the approximations of the 1991 report",
     )
-    samples: Annotated[int, Field(ge=1, le=1024)] = Field(2, description="of every pixel, where the model is direct")
+    samples: Annotated[int, Field(ge=1, le=1024)] = Field(
+        2,
+        description="of every pixel, where the model is direct; a matt material has twice as many where its picture is uneven, and one elsewhere",
+    )
     tolerance_percent: Annotated[float, Field(gt=0, le=50)] = Field(
         2.0, description="of the frame's mean radiance, for plan and full"
     )

@@ -14,6 +14,7 @@ from rangecheck.reflectance import Material
 from rangecheck.scene.sources import Source
 from rangecheck.scene.surroundings import DARKNESS, Surroundings
 from rangecheck.surface import Surface
+from rangecheck.surface.normals import corner_normals_into
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,16 +100,18 @@ class Scene:
     def corner_normals(self) -> FloatArray:
         """(m, 3, 3) float32 unit normals at each face's corners: the vertices' where smooth, else the face's own; faces without
         area get +z, which no ray ever sees."""
+        normals = np.empty((len(self.surface.faces), 3, 3), np.float32)
+        smooth = np.asarray(self.smooth_of_part or (self.smooth,) * len(self.surface.part_names))[self.surface.part_of_face]
+        known = self.vertex_normals
+        if known is None:
+            known = self.surface.vertex_normals if smooth.any() else np.zeros((0, 3))
+        if known.ndim == 2:
+            corner_normals_into(self.surface.faces, self.surface.face_normals, smooth, known, normals)
+            return normals
         flat = np.nan_to_num(self.surface.face_normals)
         flat[(flat == 0).all(axis=1)] = (0.0, 0.0, 1.0)
-        normals = np.repeat(flat[:, None, :], 3, axis=1).astype(np.float32)
-        smooth = self.smooth_of_part or (self.smooth,) * len(self.surface.part_names)
-        chosen = np.asarray(smooth)[self.surface.part_of_face]
-        if chosen.any():
-            known = self.surface.vertex_normals if self.vertex_normals is None else self.vertex_normals
-            rounded = known[chosen] if known.ndim == 3 else known[self.surface.faces[chosen]]
-            blank = (rounded == 0).all(axis=-1, keepdims=True)
-            normals[chosen] = np.where(blank, normals[chosen], rounded)
+        blank = ~smooth[:, None, None] | (known == 0).all(axis=-1, keepdims=True)
+        normals[:] = np.where(blank, flat[:, None, :], known)
         return normals
 
     def at(self, wavelengths_um: Sequence[float]) -> Scene:

@@ -14,6 +14,7 @@ import numpy as np
 
 from rangecheck.arrays import BoolArray, FloatArray, IntArray, require, unit_vectors
 from rangecheck.errors import ArrayError
+from rangecheck.surface.normals import angle_weighted_into, area_vectors_into
 
 MEASURED, INTERPOLATED, INVENTED = 0, 1, 2
 ORIGIN_NAMES = ("measured", "interpolated", "invented")
@@ -73,8 +74,9 @@ class Surface:
     @cached_property
     def area_vectors(self) -> FloatArray:
         """(m, 3) outward normal times face area, mm^2."""
-        a, b, c = self.triangles[:, 0], self.triangles[:, 1], self.triangles[:, 2]
-        return 0.5 * np.cross(b - a, c - a)
+        vectors = np.empty((len(self.faces), 3))
+        area_vectors_into(self.vertices, self.faces, vectors)
+        return vectors
 
     @cached_property
     def face_areas(self) -> FloatArray:
@@ -90,14 +92,7 @@ class Surface:
     def vertex_normals(self) -> FloatArray:
         """(n, 3) unit normals, faces weighted by their angle at the vertex (Thurmer & Wuthrich 1998)."""
         normals = np.zeros_like(self.vertices)
-        face_normals = np.nan_to_num(self.face_normals)
-        for corner in range(3):
-            here = self.triangles[:, corner]
-            to_next = unit_vectors(self.triangles[:, (corner + 1) % 3] - here)
-            to_last = unit_vectors(self.triangles[:, (corner + 2) % 3] - here)
-            angle = np.arccos(np.clip(np.nan_to_num((to_next * to_last).sum(axis=1)), -1.0, 1.0))
-            for axis in range(3):
-                normals[:, axis] += np.bincount(self.faces[:, corner], angle * face_normals[:, axis], minlength=len(normals))
+        angle_weighted_into(self.vertices, self.faces, self.face_normals, normals)
         return np.nan_to_num(unit_vectors(normals))
 
     @property

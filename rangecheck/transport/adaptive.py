@@ -18,9 +18,9 @@ from dataclasses import replace
 import numpy as np
 
 from rangecheck.arrays import FloatArray, IntArray
-from rangecheck.kernels import stage_kernel
+from rangecheck.kernels import in_chunks, stage_kernel
 from rangecheck.optics import Camera
-from rangecheck.transport.camera_rays import PictureRays, pixel_order
+from rangecheck.transport.camera_rays import pixel_order
 from rangecheck.transport.film import Film, Plate
 from rangecheck.transport.settings import Settings
 from rangecheck.transport.tracer import Tracer
@@ -31,6 +31,8 @@ EACH = 4
 _QUIET = 0.1
 #: groups per pixel at most grow so much from one round to the next, because their number rests on an estimate
 _GROWTH = 4
+#: rows of the picture that a thread looks at in one go
+_ROWS = 64
 #: how the variance of a pixel falls with its number of groups: without and with chance in the gathering
 _DECAY_OF_EDGES, _DECAY_OF_NOISE = 1.25, 1.0
 
@@ -47,49 +49,72 @@ def render_to(
 ) -> Film:
     """The picture with an estimated error of at most `error` (0.005: half a percent of the mean radiance), or as near to that as
     `most` rays per pixel bring it. `settings.passes`, `each` and `centre` are chosen here. Same bytes on any number of threads."""
-    picture = tracer.picture_rays(camera, world_from_camera)
-    pixels = pixel_order(camera.width, camera.height)
+    exposure = Exposure(tracer, camera, world_from_camera, settings, seed=seed, most=most)
+    exposure.refine(error)
+    return exposure.film()
+
+
+class Exposure:
+    """A picture that can be refined again and again: what it has seen stays. Arguments as of `render_to`."""
+
+    def __init__(
+        self, tracer: Tracer, camera: Camera, world_from_camera: FloatArray, settings: Settings, *, seed: int, most: int = 1 << 18
+    ) -> None:
+        self._tracer, self._seed, self._most = tracer, seed, max(2, most // EACH)
+        self._settings = replace(settings, passes=1, each=EACH, centre=False)
+        self._picture = tracer.picture_rays(camera, world_from_camera)
+        self._pixels = pixel_order(camera.width, camera.height)
+        self._plate = Plate(camera.height, camera.width, tracer.scene.channels)
+        once = replace(settings, passes=1, each=1, centre=True)
+        self._tally = tracer.expose(self._picture, self._pixels, once, seed, self._plate)
+        self._prior = unevenness(self._plate.mean, *self._plate.shape)
+        self._groups, self._rays = np.zeros(len(self._pixels), np.int32), np.ones(len(self._pixels), np.int32)
+
+    def refine(self, error: float) -> None:
+        """Add samples until the estimated error is at most `error` of the mean radiance, or no pixel may have more."""
+        plate, groups, pixels = self._plate, self._groups, self._pixels
+        by_chance = self._settings.by_chance
+        decay = _DECAY_OF_NOISE if by_chance else _DECAY_OF_EDGES
+        least = _near_surfaces(plate.covered, plate.shape) * np.int32(2 if by_chance else 0)
+        spread = np.empty(len(pixels), np.float32)
+        while True:
+            mean = float(plate.mean.mean(dtype=np.float64))
+            allowed = (error * mean) ** 2
+            if not allowed > 0:
+                return
+            _group_variance(plate.spread, groups, self._prior, *plate.shape, spread)
+            wanted = np.maximum(_allot(self._prior, spread, groups, allowed, self._most, decay), least)
+            more = pixels[(wanted > groups)[pixels]]
+            if not len(more):
+                return
+            fresh = more[groups[more] == 0]
+            plate.erase(fresh)
+            self._rays[fresh] = 0
+            self._tracer.expose(self._picture, more, self._settings, self._seed, plate, groups[more], wanted[more] - groups[more])
+            self._rays[more] += EACH * (wanted[more] - groups[more])
+            groups[more] = wanted[more]
+
+    def film(self) -> Film:
+        """What has been seen so far; the light budget is that of the rays through the pixels' middles."""
+        return self._plate.develop(self._tally / len(self._pixels), self._tracer.lights, self._rays.copy())
+
+
+def render_at_edges(tracer: Tracer, camera: Camera, world_from_camera: FloatArray, settings: Settings, *, seed: int = 0) -> Film:
+    """The picture with one ray through every pixel's middle, and `settings.each` rays, spread evenly, instead of it where the pixel departs
+    from its neighbours by more than `settings.uneven` of the mean radiance of what is seen. Same bytes on any number of threads."""
+    picture, pixels = tracer.picture_rays(camera, world_from_camera), pixel_order(camera.width, camera.height)
     plate = Plate(camera.height, camera.width, tracer.scene.channels)
-    tally = tracer.expose(picture, pixels, replace(settings, passes=1, each=1, centre=True), seed, plate)
+    tally = tracer.expose(picture, pixels, replace(settings, each=1, centre=True), seed, plate)
     rays = np.ones(len(pixels), np.int32)
-    _refine(tracer, picture, pixels, plate, rays, replace(settings, passes=1, each=EACH, centre=False), error, seed, most)
-    film = plate.develop(tally / len(pixels), tracer.lights, rays)
-    return film
-
-
-def _refine(
-    tracer: Tracer,
-    picture: PictureRays,
-    pixels: IntArray,
-    plate: Plate,
-    rays: IntArray,
-    settings: Settings,
-    error: float,
-    seed: int,
-    most: int,
-) -> None:
-    prior = np.empty(len(pixels), np.float32)
-    unevenness(plate.mean, *plate.shape, prior)
-    by_chance = settings.by_chance
-    decay = _DECAY_OF_NOISE if by_chance else _DECAY_OF_EDGES
-    least = _near_surfaces(plate.covered, plate.shape) * np.int32(2 if by_chance else 0)
-    groups, spread = np.zeros(len(pixels), np.int32), np.empty(len(pixels), np.float32)
-    while True:
-        mean = float(plate.mean.mean(dtype=np.float64))
-        allowed = (error * mean) ** 2
-        if not allowed > 0:
-            return
-        _group_variance(plate.spread, groups, prior, *plate.shape, spread)
-        wanted = np.maximum(_allot(prior, spread, groups, allowed, max(2, most // EACH), decay), least)
-        more = pixels[(wanted > groups)[pixels]]
-        if not len(more):
-            return
-        fresh = more[groups[more] == 0]
-        plate.erase(fresh)
-        rays[fresh] = 0
-        tracer.expose(picture, more, settings, seed, plate, groups[more] + 1, wanted[more] - groups[more])
-        rays[more] += EACH * (wanted[more] - groups[more])
-        groups[more] = wanted[more]
+    seen = float(plate.covered.sum(dtype=np.float64))
+    mean = float((plate.mean * plate.covered[:, None]).sum(dtype=np.float64)) / max(seen * tracer.scene.channels, 1.0)
+    if mean > 0:
+        departs = unevenness(plate.mean, *plate.shape)
+        more = pixels[(departs > (settings.uneven * mean) ** 2)[pixels]]
+        plate.erase(more)
+        tracer.expose(picture, more, replace(settings, centre=False), seed, plate)
+        rays[more] = settings.each
+    return plate.develop(tally / len(pixels), tracer.lights, rays)
 
 
 def _near_surfaces(covered: FloatArray, shape: tuple[int, int]) -> IntArray:
@@ -109,13 +134,12 @@ def _allot(prior: FloatArray, spread: FloatArray, groups: IntArray, allowed: flo
     left = allowed * len(prior) - quiet
     single, now = prior[noisy].astype(np.float64), groups[noisy]
     deviation = np.sqrt(np.maximum(spread[noisy], 0.0).astype(np.float64))
-    highest = np.minimum(most, np.maximum(2, _GROWTH * now))
 
     def number(step: float) -> IntArray:
         ideal = np.ceil(np.minimum((deviation / step) ** (2 / (1 + decay)), float(most)))
         # one group tells nothing of its spread, and a pixel that needs less than one keeps its single sample
         ideal = np.where(ideal > 1, ideal, np.where((now == 0) & (single <= deviation * step), 0, 2))
-        return np.maximum(now, np.minimum(ideal, highest)).astype(np.int32)
+        return np.maximum(now, np.minimum(ideal, most)).astype(np.int32)
 
     def remains(count: IntArray) -> float:
         return float(np.where(count > 0, spread[noisy] / np.maximum(count, 1.0) ** decay, single).sum())
@@ -126,15 +150,24 @@ def _allot(prior: FloatArray, spread: FloatArray, groups: IntArray, allowed: flo
     for _ in range(24):
         middle = np.sqrt(low * high)
         low, high = (middle, high) if remains(number(middle)) <= left else (low, middle)
-    wanted[noisy] = number(low)
+    # how many the goal asks for; that some places may not yet grow to it asks for no more in others
+    wanted[noisy] = np.minimum(number(low), np.maximum(2, _GROWTH * now))
     return wanted
 
 
+def unevenness(mean: FloatArray, height: int, width: int) -> FloatArray:
+    """(n,) float32 squared error that a single sample of each pixel of a picture (n, c) may have: a quarter of the pixel's largest squared
+    second difference, mean over channels."""
+    found = np.empty(len(mean), np.float32)
+    in_chunks(lambda start, stop: _unevenness(mean, height, width, start, stop, found), height, _ROWS)
+    return found
+
+
 @stage_kernel
-def unevenness(mean, height, width, prior):
-    """Squared error that a pixel's single sample may have: a quarter of its largest squared second difference, mean over channels."""
+def _unevenness(mean, height, width, first, last, prior):
+    """The same in rows first .. last - 1."""
     channels = mean.shape[1]
-    for row in range(height):
+    for row in range(first, last):
         for column in range(width):
             worst = 0.0
             for way in range(4):

@@ -19,7 +19,7 @@ from rangecheck.optics import Camera
 from rangecheck.reflectance.fast import FAST_ERROR
 from rangecheck.reflectance.forms import form_error
 from rangecheck.scene import Scene
-from rangecheck.transport.adaptive import render_to
+from rangecheck.transport.adaptive import render_at_edges, render_to
 from rangecheck.transport.camera_rays import PictureRays, pixel_order
 from rangecheck.transport.even import render_evenly, with_lobe_forms
 from rangecheck.transport.film import Film
@@ -112,7 +112,9 @@ def render(
     """The picture by its plan (made here unless given). Same bytes on any number of threads."""
     plan = plan or make_plan(tracer, camera, world_from_camera, tolerance=tolerance, seed=seed)
     work = with_lobe_forms(tracer.grey() if plan.grey else tracer, plan.forms)
-    if plan.error is None:
+    if plan.error is None and plan.settings.uneven:
+        film = render_at_edges(work, camera, world_from_camera, plan.settings, seed=seed)
+    elif plan.error is None:
         film = work.render(camera, world_from_camera, plan.settings, seed=seed)
     elif plan.model == "full":
         film = render_evenly(work, camera, world_from_camera, plan.settings, plan.error, seed=seed)

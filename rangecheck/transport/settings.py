@@ -18,6 +18,8 @@ class Settings:
     passes          observations of every pixel
     each            rays per observation, spread evenly over the pixel
     centre          rays through the pixel's middle instead
+    uneven          0: every pixel has `each` rays; above: only those whose middle departs from the line through its neighbours by more than this
+                    share of the mean radiance of what is seen, while for all others the ray through the middle is enough
     shadow_rays     rays to each source per hit: 0 one to its middle, k > 0 over its solid angle
     spike, lobe, diffuse  whether surfaces mirror, gather over the lobe, gather over the hemisphere (light from sources
                     is always reflected by all three)
@@ -39,6 +41,7 @@ class Settings:
     passes: int = 1
     each: int = 1
     centre: bool = False
+    uneven: float = 0.0
     shadow_rays: int = 1
     spike: bool = True
     lobe: bool = True
@@ -79,6 +82,8 @@ class Settings:
                 raise SettingError(f"{name} is {getattr(self, name)!r}; there are {', '.join(known)}", key=name)
         if not 0 < self.fan_step_deg <= 30:
             raise SettingError(f"fan_step_deg is {self.fan_step_deg}; it must lie between 0 and 30 degrees", key="fan_step_deg")
+        if not 0 <= self.uneven < 10:
+            raise SettingError(f"uneven is {self.uneven}; it must be at least 0 and below 10", key="uneven")
         if not 0 <= self.least < 1:
             raise SettingError(f"least is {self.least}; it must be at least 0 and below 1", key="least")
 
