@@ -12,6 +12,8 @@ from rangecheck.optics import CylindricalCamera, OrthographicCamera, PinholeCame
 from rangecheck.scan import RangeScan
 from rangecheck.surface import INTERPOLATED, INVENTED, MEASURED, Surface
 from rangecheck.surface.meshing import fuse
+from rangecheck.surface.meshing.fit_error import noise_of_blend
+from rangecheck.surface.meshing.local_fit import quiet_ranges
 from rangecheck.surface.topology import (
     boundary_edges,
     euler_numbers,
@@ -138,6 +140,37 @@ def test_the_expected_error_covers_the_true_one():
     assert (error < surface.vertex_error_mm).mean() > 0.68
     assert (error < 2 * surface.vertex_error_mm).mean() > 0.95
     assert np.median(surface.vertex_error_mm) < 0.1 / np.sqrt(5)
+
+
+def _fitted(truth: np.ndarray, sigma: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of the local fits of noisy ranges `truth` seen by parallel rays 1 mm apart, and (h, w, 6) the fits; their borders cut off."""
+    noisy = truth + np.random.default_rng(seed).normal(0.0, sigma, truth.shape)
+    fits, _ = quiet_ranges(noisy, np.array([0.0, 1.0]), sigma)
+    inside = (slice(8, -8), slice(8, -8))
+    return (fits[..., 0] - truth)[inside], fits[inside]
+
+
+def test_on_a_plane_the_local_fits_err_by_what_they_say_and_smooth_nothing_away():
+    v, u = np.mgrid[0:160, 0:160].astype(float)
+    error, fits = _fitted(500.0 + 0.2 * u - 0.1 * v, 0.1, seed=3)
+    stated = fits[..., 4] / noise_of_blend()[-1]
+    # an RMS over cells of which some 25 share their samples
+    few = np.sqrt(25 / error.size)
+    assert abs(np.sqrt(np.mean(error**2) / np.mean(stated**2)) - 1.0) < 4 * few
+    smoothed = fits[..., 5]
+    assert abs(np.mean(smoothed * np.abs(smoothed))) < 0.2 * np.mean(stated**2)
+
+
+@pytest.mark.parametrize("period", [10.0, 14.0])
+def test_ripples_that_the_local_fits_smooth_away_are_told_from_the_scan(period):
+    v, u = np.mgrid[0:160, 0:160].astype(float)
+    truth = 500.0 + 0.05 * np.sin(2 * np.pi * u / period) * np.sin(2 * np.pi * v / period)
+    error, fits = _fitted(truth, 0.02, seed=4)
+    smoothed = fits[..., 5]
+    total = np.mean(fits[..., 4] ** 2 + smoothed * np.abs(smoothed))
+    assert np.mean(error**2) > 1.5 * np.mean(fits[..., 3] ** 2)  # noise alone does not explain it
+    # the fourth-power law is the first term of a series in (width / period)^2
+    assert 0.7 < np.sqrt(np.mean(error**2) / total) < 1.4
 
 
 def test_the_same_scans_give_the_same_bytes_on_any_number_of_threads():

@@ -54,7 +54,7 @@ def busts(quick: bool) -> Part:
         subject = subject_of(name, folder / file)
         truth = SurfaceDistance(subject.surface)
         for noise in NOISES_MM[1:2] if quick else NOISES_MM:
-            rows += measured(subject, truth, noise, 128 if quick else 480, ["fuse"] if quick else list(METHODS))
+            rows += measured(subject, truth, noise, 128 if quick else 320, ["fuse"] if quick else list(METHODS))
     fused = [r for r in rows if r["method"] == "fuse"]
     findings = [
         f"{r['bust']}, noise {r['noise_mm']:g} mm: fuse {r['rms_mm']:.4f} mm RMS; {r['within_one']:.1%} within one expected error, {r['within_two']:.1%} within two"

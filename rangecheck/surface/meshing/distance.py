@@ -27,11 +27,11 @@ JUMP_PITCHES = 2.0
 
 @inline_kernel
 def look(cells, start, height, width, u, v, r):
-    """(state, distance, weight, normal, variance) of one view at a point that projects to u, v with range r.
+    """(state, distance, weight, normal, variance, smoothed away) of one view at a point that projects to u, v with range r.
 
     state: -1 nothing known, 0 free space reaches beyond every limit (the ray met nothing), 1 a surface at `distance` (signed)."""
     state = -1
-    distance = weight = nx = ny = nz = variance = 0.0
+    distance = weight = nx = ny = nz = variance = smoothed = 0.0
     if r > 0.0 and -0.5 < u < width - 0.5 and -0.5 < v < height - 0.5:
         c0, r0 = math.floor(u), math.floor(v)
         s, t = u - c0, v - r0
@@ -61,6 +61,7 @@ def look(cells, start, height, width, u, v, r):
                 nz += part * cells[cell, 6]
                 cosine += part * cells[cell, 7]
                 variance += part * cells[cell, 8]
+                smoothed += part * cells[cell, 9]
         if total > 0.999 or (total >= 0.5 and empty == 0.0):
             value /= total
             cosine /= total
@@ -76,7 +77,7 @@ def look(cells, start, height, width, u, v, r):
             state = 0
         elif total > 0.0 and total + empty > 0.999 and r < low - 1.0:
             state, distance, weight = 1, low - r, 0.0
-    return state, distance, weight, nx, ny, nz, variance
+    return state, distance, weight, nx, ny, nz, variance, smoothed
 
 
 @kernel
@@ -108,7 +109,7 @@ def _fill_blocks(
                         free[corner] += free_weight
                         continue
                     u, v, r = project(kind[s], n, x0 + i * step, y0 + j * step, z0 + k * step)
-                    known, d, w, _, _, _, _ = look(cells, start[s], size[s, 0], size[s, 1], u, v, r)
+                    known, d, w, _, _, _, _, _ = look(cells, start[s], size[s, 0], size[s, 1], u, v, r)
                     if known == 0 or (known == 1 and d > before_mm):
                         free[corner] += free_weight
                     elif known == 1 and w > 0.0 and d >= -behind_mm:
@@ -164,7 +165,9 @@ def fill_blocks(
 
 
 @kernel
-def _settle(kind, numbers, size, start, cells, points, normals, reach_mm, steps, low, high, first, last, error, looks):
+def _settle(
+    kind, numbers, size, start, cells, points, normals, reach_mm, steps, low, high, first, last, variance_of, scatter, looks
+):
     """Move points onto the averaged surface by Newton steps along its normal, kept inside their boxes."""
     for i in range(first, last):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
@@ -172,13 +175,13 @@ def _settle(kind, numbers, size, start, cells, points, normals, reach_mm, steps,
         total = 0.0
         seen_by = (1 << min(len(kind), 63)) - 1
         for _ in range(steps):
-            total = sum_d = sum_dd = noise = mx = my = mz = 0.0
+            total = sum_d = sum_dd = noise = single = lost = mx = my = mz = 0.0
             n = 0
             for s in range(len(kind)):
                 if not (seen_by >> min(s, 62)) & 1:
                     continue
                 u, v, r = project(kind[s], numbers[s], x, y, z)
-                state, d, w, nx, ny, nz, variance = look(cells, start[s], size[s, 0], size[s, 1], u, v, r)
+                state, d, w, nx, ny, nz, variance, smoothed = look(cells, start[s], size[s, 0], size[s, 1], u, v, r)
                 if state != 1 or w <= 0.0 or abs(d) > 2.0 * reach_mm:
                     if s < 62:
                         seen_by &= ~(1 << s)
@@ -194,6 +197,8 @@ def _settle(kind, numbers, size, start, cells, points, normals, reach_mm, steps,
                 sum_d += w * d
                 sum_dd += w * d * d
                 noise += w * w * variance
+                single += w * variance
+                lost += w * smoothed
                 mx, my, mz = mx + w * nx / length, my + w * ny / length, mz + w * nz / length
                 n += 1
             if n == 0:
@@ -206,24 +211,26 @@ def _settle(kind, numbers, size, start, cells, points, normals, reach_mm, steps,
             z = min(max(z - d * gz, low[i, 2]), high[i, 2])
             looks[i] = n
         if total > 0.0:
-            # scatter of the views beyond their noise is error too: bad poses, or detail that the fits smooth away
-            mean = sum_d / total
-            scatter = max(sum_dd / total - mean * mean, 0.0) / n
-            error[i] = math.sqrt(noise / (total * total) + scatter)
+            # noise averages out over the views, and what all of them smooth away does not
+            mean, noise = sum_d / total, noise / (total * total)
+            variance_of[i] = max(noise + lost / total, 0.5 * noise)
+            scatter[i] = (sum_dd / total - mean * mean - (single / total - noise)) / n
             points[i, 0], points[i, 1], points[i, 2] = x, y, z
             normals[i, 0], normals[i, 1], normals[i, 2] = gx, gy, gz
 
 
 def settle(
     views: Views, points_mm: FloatArray, normals: FloatArray, reach_mm: float, low: FloatArray, high: FloatArray, steps: int = 2
-) -> tuple[FloatArray, IntArray]:
+) -> tuple[FloatArray, FloatArray, IntArray]:
     """Move `points_mm` (n, 3), in place, onto the surface that the views average to, inside the boxes low..high (n, 3).
 
-    Returns (n,) standard error in mm from the views' weights (inf where no view is within `reach_mm`) and (n,) number of views."""
-    error, looks = np.full(len(points_mm), np.inf), np.zeros(len(points_mm), np.int32)
+    Returns, in mm^2, (n,) what the views' noise and smoothing make of the mean's error squared (inf where no view is within `reach_mm`),
+    (n,) what their scatter beyond noise adds (below 0 where they scatter less; 0 with one view); and (n,) the number of views."""
+    n = len(points_mm)
+    variance, scatter, looks = np.full(n, np.inf), np.zeros(n), np.zeros(n, np.int32)
     in_chunks(
-        lambda i, j: _settle(*views.arrays, points_mm, normals, reach_mm, steps, low, high, i, j, error, looks),
-        len(points_mm),
+        lambda i, j: _settle(*views.arrays, points_mm, normals, reach_mm, steps, low, high, i, j, variance, scatter, looks),
+        n,
         8192,
     )
-    return error, looks
+    return variance, scatter, looks

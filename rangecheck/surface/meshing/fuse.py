@@ -13,12 +13,13 @@ import numpy as np
 
 from rangecheck.arrays import BoolArray, FloatArray, IntArray
 from rangecheck.errors import SettingError, SurfaceError
+from rangecheck.kernels import kernel
 from rangecheck.scan import RangeScan
 from rangecheck.surface.meshing.blocks import Grid, add_blocks, box_for, grid_near, missing_blocks, part_touching
 from rangecheck.surface.meshing.closing import coarse_field, fill_open, smooth_open
 from rangecheck.surface.meshing.distance import fill_blocks, settle
 from rangecheck.surface.meshing.extract import MARGIN, split_quads, zero_set
-from rangecheck.surface.meshing.labels import INVENTED_ERROR, thresholds
+from rangecheck.surface.meshing.labels import UNSEEN_ERROR, thresholds
 from rangecheck.surface.meshing.openings import opened
 from rangecheck.surface.meshing.samples import distance_to_samples, label_faces, sample_grid
 from rangecheck.surface.meshing.shells import shell_of_vertex, shells_to_keep
@@ -32,9 +33,8 @@ VOXEL_IN_SPACINGS = 1.0
 BEFORE_STEPS, BEHIND_STEPS = 2.5, 2.5
 #: shells with less than this share of the largest shell's measured area are floating bits
 LEAST_SHELL = 0.02
-#: error left by detail between the samples, as a share of their spacing, and a factor on the sum: with these two, 68 and 95 % of the
-#: true errors lay within one and two expected ones on simulated scans of three busts at noises of 0.05, 0.2 and 0.5 mm
-UNRESOLVED, ERROR_FACTOR = 0.015, 0.955
+#: rings of neighbours over which the scatter of the views is pooled
+SCATTER_RINGS = 4
 OPEN_SWEEPS = 8
 
 
@@ -69,7 +69,7 @@ def fuse(
     points, normals, low, seen, quads = zero_set(grid, coarse)
     if len(quads) == 0:
         raise SurfaceError("the scans' distances have no zero set; check their poses and unit, or choose a smaller voxel_mm")
-    error = _settle(views, points, normals, low, seen, step)
+    error = _settle(views, points, normals, low, seen, quads, step)
     faces = split_quads(points, quads)
     nearby = sample_grid(views.samples_mm, measured)
     origin = label_faces(nearby, points, faces, measured, interpolated)
@@ -77,7 +77,7 @@ def fuse(
     unseen = ~np.isfinite(error)
     reach = float(np.linalg.norm(np.ptp(points, axis=0)))
     wide = sample_grid(views.samples_mm, interpolated)
-    error[unseen] = INVENTED_ERROR * distance_to_samples(wide, points[unseen], reach)
+    error[unseen] = UNSEEN_ERROR * distance_to_samples(wide, points[unseen], reach)
     surface = Surface(points + views.shift_mm, faces, origin_of_face=origin, vertex_error_mm=error)
     return opened(surface, closing, largest_hole_mm)
 
@@ -119,16 +119,40 @@ def _crossed(coarse: FloatArray) -> BoolArray:
     return some & ~every
 
 
-def _settle(views: Views, points: FloatArray, normals: FloatArray, low: FloatArray, seen: BoolArray, step: float) -> FloatArray:
-    """Settle the vertices that come from measured distances; returns (n,) standard error in mm, inf for the others."""
-    error = np.full(len(points), np.inf)
+def _settle(
+    views: Views, points: FloatArray, normals: FloatArray, low: FloatArray, seen: BoolArray, quads: IntArray, step: float
+) -> FloatArray:
+    """Settle the vertices that come from measured distances; returns (n,) standard error in mm, inf for the others.
+
+    Poses that are off, and detail that views resolve differently, show as scatter of the views beyond their noise. Two or three views
+    tell it badly at one vertex: it is the mean over the vertices around."""
+    error, scatter, others = np.full(len(points), np.inf), np.zeros(len(points)), np.zeros(len(points))
     chosen = np.flatnonzero(seen)
     moved, directions = points[chosen], normals[chosen]
     box_low, box_high = low[chosen] + MARGIN * step, low[chosen] + (1 - MARGIN) * step
-    noise, _ = settle(views, moved, directions, 1.5 * step, box_low, box_high)
-    error[chosen] = ERROR_FACTOR * np.hypot(noise, UNRESOLVED * views.spacing_mm)
+    variance, beyond, looks = settle(views, moved, directions, 1.5 * step, box_low, box_high)
     points[chosen], normals[chosen] = moved, directions
+    others[chosen] = np.maximum(looks - 1, 0)
+    scatter[chosen] = beyond * others[chosen]
+    for _ in range(SCATTER_RINGS):
+        scatter, others = _with_neighbours(quads, scatter), _with_neighbours(quads, others)
+    pooled = np.maximum(scatter[chosen], 0.0) / np.maximum(others[chosen], 1e-12)
+    error[chosen] = np.sqrt(variance + np.where(looks > 1, pooled, 0.0))
     return error
+
+
+@kernel
+def _with_neighbours(quads, values):
+    """Each vertex's value plus those at the other ends of its edges, every edge as often as it has faces, over one plus their number."""
+    total, count = values.copy(), np.ones(len(values))
+    for q in range(len(quads)):
+        for corner in range(4):
+            a, b = quads[q, corner], quads[q, (corner + 1) % 4]
+            total[a] += values[b]
+            total[b] += values[a]
+            count[a] += 1.0
+            count[b] += 1.0
+    return total / count
 
 
 def _without_floating_bits(

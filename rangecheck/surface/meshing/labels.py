@@ -2,11 +2,12 @@
 
 The expected error of a vertex is the samples' noise along the normal, divided by the root of the number of samples the method
 averaged there (those within half a cell of the vertex, at least one); where the nearest sample is farther than `interpolated_mm`, it
-is INVENTED_ERROR of that distance.
+is UNSEEN_ERROR of that distance.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -22,8 +23,9 @@ from rangecheck.surface.surface import Surface
 
 #: default thresholds of the labels, in sample spacings
 MEASURED_IN_SPACINGS, INTERPOLATED_IN_SPACINGS = 2.0, 6.0
-#: expected error of invented surface as a share of the distance to the nearest sample
-INVENTED_ERROR = 0.3
+#: expected error where nothing was measured, in distances to the nearest sample: the object passes through that sample, so the vertex is
+#: at most so far off, and any error up to there is as likely
+UNSEEN_ERROR = 1.0 / math.sqrt(3.0)
 
 
 def thresholds(spacing_mm: float, measured_mm: float | None, interpolated_mm: float | None) -> tuple[float, float]:
@@ -63,5 +65,5 @@ def labelled(
         far = ~np.isfinite(distance)
         reach = float(np.linalg.norm(np.ptp(np.concatenate([vertices, points]), axis=0)))
         wide = sample_grid(points, 0.5 * interpolated_mm)
-        error[far] = np.maximum(error[far], INVENTED_ERROR * distance_to_samples(wide, vertices[far], reach))
+        error[far] = np.maximum(error[far], UNSEEN_ERROR * distance_to_samples(wide, vertices[far], reach))
     return replace(surface, origin_of_face=origin, vertex_error_mm=error)

@@ -12,15 +12,13 @@ itself: the 3 x 3 mask of Immerkaer (1996), which annihilates quadratics, in cla
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 
 import numpy as np
 
 from rangecheck.arrays import FloatArray
 from rangecheck.kernels import in_chunks, inline_kernel, kernel
+from rangecheck.surface.meshing.fit_error import STOPPED, noise_of_fits, quadratic_windows, smoothed_away, value_weights
 
-#: standard deviations of the Gaussian windows in pixels, narrow to wide; each window reaches two of them
-WIDTHS_PX = (0.9, 1.3, 1.9, 2.7)
 #: half length of a confidence interval in standard errors: short, since what noise is left is averaged over several scans
 CONFIDENCE = 0.7
 #: neighbours steeper than this against the plane across the ray belong to another surface
@@ -35,23 +33,6 @@ EDGE_WIDTHS_PX = np.array([0.8])
 RIDGE = 2.0
 ROWS = 16
 Offsets = tuple[FloatArray | None, FloatArray | None]
-
-
-@lru_cache(maxsize=1)
-def quadratic_windows() -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Full windows: weights (scales, 3, side, side) for value, u slope, v slope; half sides (scales,); noise gain (scales,)."""
-    reach = [math.ceil(2.0 * width) for width in WIDTHS_PX]
-    side = 2 * max(reach) + 1
-    weights = np.zeros((len(reach), 3, side, side))
-    gain = np.zeros(len(reach))
-    for scale, (width, r) in enumerate(zip(WIDTHS_PX, reach)):
-        v, u = np.mgrid[-r : r + 1, -r : r + 1].astype(float)
-        w = np.exp(-0.5 * (u * u + v * v) / width**2).ravel()
-        design = np.stack([np.ones(u.size), u.ravel(), v.ravel(), (u * u).ravel(), (u * v).ravel(), (v * v).ravel()], axis=1)
-        solve = np.linalg.solve(design.T @ (design * w[:, None]), (design * w[:, None]).T)
-        weights[scale, :, : 2 * r + 1, : 2 * r + 1] = solve[:3].reshape(3, 2 * r + 1, 2 * r + 1)
-        gain[scale] = np.sqrt((solve[0] ** 2).sum())
-    return weights, np.array(reach), gain
 
 
 @inline_kernel
@@ -200,21 +181,45 @@ def _edge_fit(ranges, row, col, plane_u, plane_v, pitch_mm, sigma, widths, confi
 
 
 @kernel
-def _fits(ranges, sigma_cell, pitch, plane_u, plane_v, windows, reaches, gains, edge_widths, confidence, first, last, out):
-    """out (h, w, 4): range, slopes, standard error in mm of each cell; NaN where a cell has too few neighbours of its own surface."""
+def _fits(
+    ranges,
+    sigma_cell,
+    pitch,
+    plane_u,
+    plane_v,
+    windows,
+    reaches,
+    gains,
+    apart,
+    edge_widths,
+    confidence,
+    first,
+    last,
+    out,
+    chosen,
+    steps,
+):
+    """out (h, w, 4): range, slopes, noise gain times noise in mm of each cell, NaN where a cell has too few neighbours of its own surface;
+    chosen (h, w): number of the window, -1 at edges, plus STOPPED where the next one was whole and disagreed; steps (h, w, scales - 1): square of the step from each width to the next, less what
+    noise makes of it, at every second cell and as far as windows are whole (NaN elsewhere)."""
     height, width = ranges.shape
     scales = len(reaches)
     a, b, unit, edge = np.zeros((6, 6)), np.zeros(6), np.zeros(6), np.zeros(4)
     for row in range(first, last):
         for col in range(width):
             out[row, col, :] = np.nan
+            chosen[row, col] = -1
+            told = row % 2 == 0 and col % 2 == 0
+            if told:
+                steps[row // 2, col // 2, :] = np.nan
             pu, pv = plane_u[row, col], plane_v[row, col]
             if not math.isfinite(pu):
                 continue
             centre, sigma = ranges[row, col], sigma_cell[row, col]
             pitch_mm = pitch[0] * centre + pitch[1]
             low, high = -np.inf, np.inf
-            found = False
+            found = settled = False
+            narrower = 0.0
             for scale in range(scales):
                 r = reaches[scale]
                 if row < r or col < r or row + r >= height or col + r >= width:
@@ -234,11 +239,20 @@ def _fits(ranges, sigma_cell, pitch, plane_u, plane_v, windows, reaches, gains, 
                         break
                 if not whole:
                     break
+                if told and scale > 0:
+                    steps[row // 2, col // 2, scale - 1] = (value - narrower) ** 2 - apart[scale - 1] * sigma * sigma
+                narrower = value
                 half = confidence * gains[scale] * sigma
                 low, high = max(low, value - half), min(high, value + half)
-                if found and low > high:
+                if found and low > high and not settled:
+                    settled = True
+                    chosen[row, col] += STOPPED
+                if settled:
+                    if told:
+                        continue
                     break
                 found = True
+                chosen[row, col] = scale
                 out[row, col, 0] = centre + value
                 out[row, col, 1] = pu + slope_u
                 out[row, col, 2] = pv + slope_v
@@ -282,7 +296,8 @@ def quiet_ranges(
 
     ranges (h, w) float64 mm, NaN where nothing returned; pitch (2,): mm per pixel is pitch[0] * range + pitch[1]; off: how far
     the samples lie off their cells' centres, in pixels along u and v, (h, w) each: they are moved there along the local plane.
-    Returns (h, w, 4) float32: range, u slope, v slope, standard error in mm; and (h, w) float32 standard deviation of one range."""
+    Returns (h, w, 6) float32: range, u slope, v slope, noise gain times noise in mm, standard error by noise in mm of what is read between cells, and root mean
+    square of what the fit smooths away in mm; and (h, w) float32 standard deviation of one range."""
     height, width = ranges.shape
     finite = np.isfinite(ranges)
     slope_u, slope_v, rough = (np.empty((height, width), np.float32) for _ in range(3))
@@ -298,13 +313,33 @@ def quiet_ranges(
     centres = 0.5 * (COSINE_CLASSES[1:] + COSINE_CLASSES[:-1])
     sigma = np.interp(np.nan_to_num(cosine), centres, classes).astype(np.float32)
     sigma = np.maximum(sigma, np.float32(1e-3) * lateral.astype(np.float32))
-    out = np.empty((height, width, 4), np.float32)
+    out = np.empty((height, width, 6), np.float32)
     windows, reaches, gains = quadratic_windows()
+    apart = (np.diff(value_weights(), axis=0) ** 2).sum(axis=1)
+    chosen = np.empty((height, width), np.int8)
+    steps = np.empty((-(-height // 2), -(-width // 2), len(gains) - 1), np.float32)
     in_chunks(
         lambda i, j: _fits(
-            ranges, sigma, pitch, slope_u, slope_v, windows, reaches, gains, EDGE_WIDTHS_PX, confidence, i, j, out
+            ranges,
+            sigma,
+            pitch,
+            slope_u,
+            slope_v,
+            windows,
+            reaches,
+            gains,
+            apart,
+            EDGE_WIDTHS_PX,
+            confidence,
+            i,
+            j,
+            out,
+            chosen,
+            steps,
         ),
         height,
         ROWS,
     )
+    out[..., 4] = noise_of_fits(out[..., 3], sigma, chosen, confidence)
+    out[..., 5] = smoothed_away(steps, apart * sigma[::2, ::2, None] ** 2, chosen)
     return out, sigma

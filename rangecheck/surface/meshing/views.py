@@ -23,8 +23,9 @@ from rangecheck.scan import RangeScan
 from rangecheck.surface.meshing.local_fit import BEND_TAN, quiet_ranges
 from rangecheck.surface.meshing.projection import project, projection_of
 
-#: numbers per cell: range, half u slope, half v slope, weight, normal x y z, |ray . normal|, variance along the normal
-RANGE, HALF_U, HALF_V, WEIGHT, NORMAL, COSINE, VARIANCE, FIELDS = 0, 1, 2, 3, 4, 7, 8, 9
+#: numbers per cell: range, half u slope, half v slope, weight, normal x y z, |ray . normal|, variance along the normal by noise, and
+#: mean square of what the fit smooths away
+RANGE, HALF_U, HALF_V, WEIGHT, NORMAL, COSINE, VARIANCE, SMOOTHED, FIELDS = 0, 1, 2, 3, 4, 7, 8, 9, 10
 #: cells over which the weight rises from the edge of what a scan saw
 FEATHER_CELLS = 2.5
 #: half width of the gaps between samples of other scans, projected into a scan, that count as covered
@@ -40,7 +41,7 @@ class Views:
     """All scans, concatenated.
 
     kind (s,) int64; numbers (s, 37) pose and camera; size (s, 2) int64 height, width; start (s,) int64 first cell of each scan;
-    cells (n, 9) float32 records: range is NaN where nothing is known and +inf where the ray met nothing;
+    cells (n, 10) float32 records: range is NaN where nothing is known and +inf where the ray met nothing;
     noise_mm (n,) float32 standard deviation of one range; samples_mm (k, 3) valid samples, shifted world frame;
     spacing_mm median distance between neighbouring samples along the surface; shift_mm (3,)."""
 
@@ -109,7 +110,9 @@ def _records(fit, origins, directions, rotation, edge, pitch, first, last, cells
             cells[i, 4] = rotation[0, 0] * nx + rotation[0, 1] * ny + rotation[0, 2] * nz
             cells[i, 5] = rotation[1, 0] * nx + rotation[1, 1] * ny + rotation[1, 2] * nz
             cells[i, 6] = rotation[2, 0] * nx + rotation[2, 1] * ny + rotation[2, 2] * nz
-            cells[i, 7], cells[i, 8] = cosine, error * error
+            noise, smoothed = float(fit[row, col, 4]) * cosine, float(fit[row, col, 5]) * cosine
+            cells[i, 7], cells[i, 8] = cosine, noise * noise + aside * aside * max(1.0 - cosine * cosine, 0.0)
+            cells[i, 9] = smoothed * abs(smoothed)
 
 
 @kernel
@@ -178,7 +181,7 @@ def _run(mask: BoolArray, axis: int, combine: np.ufunc) -> BoolArray:
 
 
 def _cells_of(scan: RangeScan, pose: FloatArray, known: dict[Camera, tuple[FloatArray, FloatArray]]):
-    """Kind, numbers (37,), records (h w, 9), noise (h w,) and lateral pitch at each record of one scan at `pose` (4, 4)."""
+    """Kind, numbers (37,), records (h w, 10), noise (h w,) and lateral pitch at each record of one scan at `pose` (4, 4)."""
     seen = projection_of(scan, known.get(scan.camera))
     known.clear()
     known[scan.camera] = seen.origins, seen.directions

@@ -1,0 +1,133 @@
+"""What local fits err by: the noise that is left in them, and the detail that they smooth away.
+
+The windows of `local_fit` in pixels. Noise: neighbours' fits are blended between cells and share most of their samples; and a width at
+which noise stopped the growing windows errs more than its noise gain says, by as much as the same choice among fits of pure noise shows.
+Detail: the error of a local quadratic grows with the fourth power of its width, so the step from one width to the next, less what noise
+makes of it and pooled over a neighbourhood, gives what is left at either (Richardson's extrapolation).
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+
+from rangecheck.arrays import FloatArray, IntArray
+
+#: standard deviations of the Gaussian windows in pixels, narrow to wide; each window reaches two of them
+WIDTHS_PX = (0.9, 1.3, 1.9, 2.7)
+#: half widths, in cells, of the neighbourhoods over which the steps between widths are pooled: the small one where the step is so clear
+#: that noise makes its square by this factor less, which a handful of cells tells
+POOL_CELLS, NEAR_CELLS, CLEAR = 6, 2, 2.0
+#: added to the number of a window where the next one was whole and disagreed
+STOPPED = 8
+
+
+@lru_cache(maxsize=1)
+def quadratic_windows() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Full windows: weights (scales, 3, side, side) for value, u slope, v slope; half sides (scales,); noise gain (scales,)."""
+    reach = [math.ceil(2.0 * width) for width in WIDTHS_PX]
+    side = 2 * max(reach) + 1
+    weights = np.zeros((len(reach), 3, side, side))
+    gain = np.zeros(len(reach))
+    for scale, (width, r) in enumerate(zip(WIDTHS_PX, reach)):
+        v, u = np.mgrid[-r : r + 1, -r : r + 1].astype(float)
+        w = np.exp(-0.5 * (u * u + v * v) / width**2).ravel()
+        design = np.stack([np.ones(u.size), u.ravel(), v.ravel(), (u * u).ravel(), (u * v).ravel(), (v * v).ravel()], axis=1)
+        solve = np.linalg.solve(design.T @ (design * w[:, None]), (design * w[:, None]).T)
+        weights[scale, :, : 2 * r + 1, : 2 * r + 1] = solve[:3].reshape(3, 2 * r + 1, 2 * r + 1)
+        gain[scale] = np.sqrt((solve[0] ** 2).sum())
+    return weights, np.array(reach), gain
+
+
+@lru_cache(maxsize=1)
+def value_weights() -> FloatArray:
+    """(scales, side * side) weights of the value in each window, all about one middle."""
+    weights, reaches, _ = quadratic_windows()
+    side = weights.shape[-1]
+    centred = np.zeros((len(reaches), side, side))
+    for scale, r in enumerate(reaches):
+        first = side // 2 - r
+        centred[scale, first : first + 2 * r + 1, first : first + 2 * r + 1] = weights[scale, 0, : 2 * r + 1, : 2 * r + 1]
+    return centred.reshape(len(reaches), -1)
+
+
+@lru_cache(maxsize=1)
+def noise_of_blend() -> FloatArray:
+    """(scales,) noise of the blend of four neighbours' planes at half slope, over that of one of them, as a root mean square over the square
+    between them: neighbours share most of their samples, but not all."""
+    weights, reaches, gain = quadratic_windows()
+    result = np.zeros(len(reaches))
+    places = (np.arange(8) + 0.5) / 8
+    for scale, r in enumerate(reaches):
+        window = weights[scale, :, : 2 * r + 1, : 2 * r + 1]
+        for s in places:
+            for t in places:
+                blend = np.zeros((2 * r + 2, 2 * r + 2))
+                for du, dv in ((0, 0), (1, 0), (0, 1), (1, 1)):
+                    part = (s if du else 1 - s) * (t if dv else 1 - t)
+                    plane = window[0] + 0.5 * ((s - du) * window[1] + (t - dv) * window[2])
+                    blend[dv : dv + 2 * r + 1, du : du + 2 * r + 1] += part * plane
+                result[scale] += (blend**2).sum() / len(places) ** 2
+    blended: FloatArray = np.sqrt(result) / gain
+    return blended
+
+
+@lru_cache(maxsize=2)
+def noise_of_choice(confidence: float) -> tuple[FloatArray, FloatArray]:
+    """What the confidence intervals choose in pure noise of one unit, of 200 000 draws of all fits together, which share their samples:
+    (scales,) root mean square error where a width is the widest chosen, and (scales,) how often it is."""
+    weights = value_weights()
+    gain = np.sqrt((weights * weights).sum(axis=1))
+    draws = np.random.default_rng(0).multivariate_normal(np.zeros(len(gain)), weights @ weights.T, 200_000, method="cholesky")
+    low = np.maximum.accumulate(draws - confidence * gain, axis=1)
+    high = np.minimum.accumulate(draws + confidence * gain, axis=1)
+    chosen = (low <= high).cumprod(axis=1).sum(axis=1).astype(int) - 1
+    errors = draws[np.arange(len(draws)), chosen]
+    error = np.array([np.sqrt(np.mean(errors[chosen == k] ** 2)) for k in range(len(gain))])
+    return error, np.bincount(chosen, minlength=len(gain)) / len(draws)
+
+
+def noise_of_fits(plain: FloatArray, sigma: FloatArray, chosen: IntArray, confidence: float) -> FloatArray:
+    """(h, w) mm: `plain` (noise gain times noise) of the blend of four neighbours, and more where noise stopped the windows.
+
+    A width that a scan's cells stop at more often than noise alone would make them was chosen, beyond that share, for the surface."""
+    error, often = noise_of_choice(confidence)
+    gain = quadratic_windows()[2]
+    known = chosen >= 0
+    result = plain * noise_of_blend().astype(np.float32)[np.where(known, chosen % STOPPED, 0)]
+    for scale in range(len(gain) - 1):
+        stopped = known & (chosen == scale + STOPPED)
+        able = int((known & ((chosen % STOPPED) >= scale) & ((chosen % STOPPED) + (chosen >= STOPPED) > scale)).sum())
+        share = min(1.0, often[scale] * able / max(int(stopped.sum()), 1))
+        more = math.sqrt(share * (error[scale] / gain[scale]) ** 2 + 1.0 - share)
+        result[stopped] *= np.float32(more)
+    return result
+
+
+def _pooled(steps: FloatArray, cells: int) -> FloatArray:
+    """The mean of `steps` (h, w, n), which stand for every second cell, over `cells` to each side, of those known; 0 where none is."""
+    from scipy.ndimage import uniform_filter
+
+    side = 2 * (cells // 2) + 1
+    known = np.isfinite(steps)
+    total = uniform_filter(np.where(known, steps, np.float32(0)), (side, side, 0), mode="constant")
+    count = uniform_filter(known.astype(np.float32), (side, side, 0), mode="constant")
+    pooled: FloatArray = total / np.maximum(count, 0.5 / side**2)
+    return pooled
+
+
+def smoothed_away(steps: FloatArray, noise: FloatArray, chosen: IntArray) -> FloatArray:
+    """(h, w) mm that the chosen width smooths away: the signed root of a mean square, which is negative where noise says less than nothing.
+
+    steps (h / 2, w / 2, scales - 1) squares of the steps between widths less their noise's; noise the same shape, what was taken off."""
+    near, around = _pooled(steps, NEAR_CELLS), _pooled(steps, POOL_CELLS)
+    squares = np.where(near > CLEAR * noise, near, around)
+    fourth = np.array(WIDTHS_PX) ** 4
+    share = np.array([fourth[0] / (fourth[1] - fourth[0]), *(fourth[1:] / (fourth[1:] - fourth[:-1]))]) ** 2
+    step = np.maximum(np.arange(len(fourth)) - 1, 0)
+    scale = np.where(chosen < 0, 0, chosen % STOPPED)
+    full = squares.repeat(2, axis=0)[: chosen.shape[0]].repeat(2, axis=1)[:, : chosen.shape[1]]
+    mean_square = np.take_along_axis(full, step[scale][..., None], axis=2)[..., 0] * share[scale]
+    return (np.sign(mean_square) * np.sqrt(np.abs(mean_square))).astype(np.float32)
