@@ -131,7 +131,7 @@ def test_light_is_not_kept_where_something_shines():
     scene = Scene(ball(2), (SATIN,), surroundings=constant(1.0))
     with pytest.raises(SceneError, match="satin"):
         gather_irradiance(Tracer(scene))
-    with pytest.raises(SettingError, match="paths, cache"):
+    with pytest.raises(SettingError, match="paths, second, cache"):
         Settings(gather_diffuse="hope")
 
 

@@ -1,6 +1,7 @@
 """The study of what pictures cost finds the error that is there, and the effort that meets a goal."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,12 +21,17 @@ def test_the_error_of_a_picture_is_found_whatever_the_noise_of_its_reference():
 
 def test_the_effort_that_meets_a_goal_lies_between_two_that_were_measured():
     truth = np.ones((4, 4))
-    racer = Racer("one", lambda samples, seed: truth + 1 / math.sqrt(samples), 1, 2.0, 1 << 20, (truth, truth), 0.0, "samples")
-    rows, effort = run_to(racer, np.ones((4, 4), bool), 0.03)
-    assert effort == pytest.approx(1 / 0.03**2)
-    assert rows[-1]["error"] <= 0.03 < rows[-2]["error"]
-    tired = Racer("one", racer.picture, 1, 2.0, 8, (truth, truth), 0.0, "samples")
-    assert math.isnan(run_to(tired, np.ones((4, 4), bool), 0.03)[1])
+    efforts = [2.0**k for k in range(12)]
+    racer = Racer("one", lambda samples, seed: truth + 1 / math.sqrt(samples), efforts, (truth, truth), 0.0, "samples")
+    everywhere = np.ones((4, 4), bool)
+    found = run_to(racer, everywhere, 0.03)
+    assert found.effort == pytest.approx(1 / 0.03**2) and found.more == 1
+    assert found.rows[-1]["error"] <= 0.03 < found.rows[-2]["error"]
+    tired = replace(racer, efforts=efforts[:4])
+    assert math.isnan(run_to(tired, everywhere, 0.03).more)
+    # what lies beyond its efforts follows from how its error falls
+    beyond = run_to(replace(tired, extends=True), everywhere, 0.03)
+    assert beyond.effort == 8 and beyond.effort * beyond.more == pytest.approx(1 / 0.03**2)
 
 
 def test_pictures_are_timed_beside_their_cast():

@@ -291,12 +291,12 @@ def test_each_material_gets_the_cheapest_form_of_its_lobe_that_the_picture_allow
     )
     tracer = Tracer(room)
     camera, pose = looking(24, 24, fov=26.0, eye=(0, 60, 290))
-    plan = make_plan(tracer, camera, pose, tolerance=0.02)
+    plan = make_plan(tracer, camera, pose, tolerance=0.03)
     assert plan.forms == ("smooth", "fast")
     said = "\n".join(plan.explain())
     assert "lobe of polished: the smooth form" in said and "lobe of satin: the fast form, within 0.1 % of the series" in said
     same = [render(tracer, camera, pose, plan=replace(plan, forms=forms)) for forms in (plan.forms, ())]
-    assert difference(*same) < 0.2 * 0.02
+    assert difference(*same) < 0.2 * 0.03
 
 
 def test_nearly_grey_scenes_are_computed_at_one_wavelength_where_the_tolerance_allows():
@@ -310,13 +310,30 @@ def test_nearly_grey_scenes_are_computed_at_one_wavelength_where_the_tolerance_a
 def test_diffuse_light_is_looked_up_where_interpolation_is_good_enough_and_says_so():
     tracer = Tracer(scene("ball plaster sky"))
     camera, pose = looking(24, 24, fov=26.0, eye=(0, 60, 290))
-    plan = make_plan(tracer, camera, pose, tolerance=0.02)
+    loose = make_plan(tracer, camera, pose, tolerance=0.05)
+    assert loose.settings.gather_diffuse == "paths"
+    assert any("followed path by path, about" in line for line in loose.explain())
+    plan = make_plan(tracer, camera, pose, tolerance=0.005)
     assert plan.settings.diffuse and plan.settings.gather_diffuse == "cache"
-    assert any("diffuse light: looked up;" in line for line in plan.explain())
+    assert any("diffuse light: looked up at the surface seen;" in line for line in plan.explain())
     # on a ball that sees nothing of itself what the sky gives is all, and the paths' picture knows it
     full = tracer.render(camera, pose, Settings(passes=64, each=4, depth=4), seed=9)
     noise = full.standard_error() / full.mean_radiance
-    assert difference(render(tracer, camera, pose, plan=plan), full) < math.hypot(0.02, noise)
+    assert difference(render(tracer, camera, pose, plan=plan), full) < math.hypot(0.005, noise)
+
+
+def test_light_looked_up_one_reflection_on_is_that_of_paths():
+    tracer = Tracer(scene("table plaster dark"))
+    camera, pose = looking(20, 20, fov=26.0, eye=(0, 60, 290))
+    settings = Settings(each=16, spike=False, lobe=False, depth=12)
+    paths = [tracer.render(camera, pose, replace(settings, passes=6), seed=seed) for seed in (1, 2)]
+    kept = tracer.render(camera, pose, replace(settings, gather_diffuse="second", records=3000, passes=2), seed=3)
+    noise = math.hypot(kept.standard_error(), paths[0].standard_error()) / kept.mean_radiance
+    assert difference(kept, paths[0]) < 1.5 * noise
+    # over the frame noise averages out: what keeping shifts the mean by is below a percent and three standard errors of the paths' mean
+    mean = 0.5 * (paths[0].mean_radiance + paths[1].mean_radiance)
+    assert abs(kept.mean_radiance / mean - 1) < 0.01 + 3 * noise / 20
+    assert kept.variance.mean() * 2 * 16 < 0.5 * paths[0].variance.mean() * 6 * 16
 
 
 def test_two_pictures_tell_the_error_of_their_mean_and_keep_a_tight_promise_with_fewer_samples():

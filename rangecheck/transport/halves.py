@@ -25,7 +25,7 @@ _HOPEFUL = 2.5
 _AIM = 0.97
 _STEPS = 8
 #: standard errors of the measured squared error that are added to it
-_SURE = 1.5
+_SURE = 2.0
 _OTHER = 0x5BD1E995
 
 

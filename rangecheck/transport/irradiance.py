@@ -14,12 +14,14 @@ on the surface, is `error`; noise of the two does not enter, for the product of 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from rangecheck.arrays import FloatArray, IntArray
+from rangecheck.arrays import BoolArray, FloatArray, IntArray
 from rangecheck.errors import SceneError
 from rangecheck.kernels import in_chunks, thread_count
 from rangecheck.reflectance import Material
@@ -66,9 +68,12 @@ class Stored(NamedTuple):
 @dataclass(frozen=True, eq=False)
 class IrradianceCache:
     """error: root mean square of what interpolation is off by, relative to the mean light on the surface; records, rays of each;
-    reflections that were followed before the last; met: the error asked for was met."""
+    reflections that were followed before the last; met: the error asked for was met; everything: the same with the light of the sources
+    added to what other places send; off_at: see `_Gathering.off_at`."""
 
     stored: Stored = field(repr=False)
+    everything: Stored = field(repr=False)
+    off_at: Callable[..., FloatArray] = field(repr=False)
     error: float
     records: int
     rays: int
@@ -78,8 +83,15 @@ class IrradianceCache:
     def in_one_channel(self, channel: int) -> IrradianceCache:
         """The same at one wavelength."""
         one = slice(channel, channel + 1)
-        light = np.ascontiguousarray(self.stored.light[:, one])
-        return replace(self, stored=self.stored._replace(light=light, albedo=np.ascontiguousarray(self.stored.albedo[:, one])))
+
+        def alone(stored: Stored) -> Stored:
+            light, albedo = (np.ascontiguousarray(a[:, one]) for a in (stored.light, stored.albedo))
+            return stored._replace(light=light, albedo=albedo)
+
+        def off_at(*places: FloatArray) -> FloatArray:
+            return self.off_at(*places)[..., one]
+
+        return replace(self, stored=alone(self.stored), everything=alone(self.everything), off_at=off_at)
 
     def explain(self) -> str:
         """One line for people."""
@@ -172,7 +184,16 @@ class _Gathering:
         shares = shares / shares.sum() if shares.sum() > 0 else shares
         stored = Stored(self.node_of_face, self.steps, light, self.albedo, self.sides, shares)
         off = self._error(stored)
-        return IrradianceCache(stored, off, len(chosen), met.rays, reflections, off <= error)
+        everything = stored._replace(light=light + self.direct, shares=self._shares_of_all(shares, light))
+        return IrradianceCache(
+            stored, everything, partial(self.off_at, stored), off, len(chosen), met.rays, reflections, off <= error
+        )
+
+    def _shares_of_all(self, shares: FloatArray, light: FloatArray) -> FloatArray:
+        """(lights,) whose the light is, when that of the sources is added."""
+        kept, straight = float(light.sum(dtype=np.float64)), self.by_light
+        total = kept + float(straight.sum())
+        return (shares * kept + straight) / total if total > 0 else shares
 
     def _direct_light(self, nodes: Nodes) -> tuple[FloatArray, FloatArray]:
         """(n, c) float32 radiance of white nodes in the light of the sources alone; (sources,) how much of it is whose."""
@@ -296,15 +317,28 @@ class _Gathering:
         normal = np.ascontiguousarray(normal, np.float32)
         kept, straight = (np.empty((places, self.channels), np.float32) for _ in range(2))
         look_up(stored, self.direct, face, u, v, back, kept, straight)
-        gaps = [
-            self._sum(self._look(place, normal, _PILOT_RAYS, self.seed + 0x5EED + k), stored.light) - kept if self.depth > 1
-            else self._look(place, normal, _PILOT_RAYS, self.seed + 0x5EED + k).sky - kept
-            for k in (0, 1)
-        ]  # fmt: skip
+        gaps = self._gaps(stored, kept, place, normal)
         mean = float((kept + straight).mean(dtype=np.float64))
         product = (gaps[0].astype(np.float64) * gaps[1]).mean(axis=1)
         squared = float(product.mean()) + 2.0 * float(product.std()) / math.sqrt(places)
         return math.sqrt(max(squared, 0.0)) / mean if mean > 0 else 0.0
+
+    def _gaps(self, stored: Stored, kept: FloatArray, place: FloatArray, normal: FloatArray) -> FloatArray:
+        """(2, n, c) what places are sent, gathered twice afresh, less what is kept there."""
+        looks = (self._look(place, normal, _PILOT_RAYS, self.seed + 0x5EED + k) for k in (0, 1))
+        return np.stack([(self._sum(met, stored.light) if self.depth > 1 else met.sky) - kept for met in looks])
+
+    def off_at(
+        self, stored: Stored, face: IntArray, u: FloatArray, v: FloatArray, back: BoolArray, normal: FloatArray
+    ) -> FloatArray:
+        """(2, n, c) how far what is kept at places (u, v) of faces, on their `back` or front side, is from what is gathered there along
+        unit normals (n, 3): twice, with independent chance. Radiance of a white surface."""
+        corners = self.tracer.geometry.corners.reshape(-1, 3, 3)[face]
+        weights = np.stack([1 - u - v, u, v], axis=1)[:, :, None]
+        place = np.ascontiguousarray((weights * corners).sum(axis=1), np.float32)
+        kept, straight = (np.empty((len(face), self.channels), np.float32) for _ in range(2))
+        look_up(stored, self.direct, face, u, v, back & (self.sides == 2), kept, straight)
+        return self._gaps(stored, kept, place, np.ascontiguousarray(normal, np.float32))
 
 
 @dataclass(frozen=True, eq=False)

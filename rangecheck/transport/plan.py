@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from rangecheck.transport.camera_rays import PictureRays, pixel_order
 from rangecheck.transport.even import render_evenly, with_lobe_forms
 from rangecheck.transport.film import Film
 from rangecheck.transport.halves import render_in_halves
+from rangecheck.transport.plan_kept import off_at_once, off_at_second, rays_of_paths, rays_to_keep, records_for, seen_places
 from rangecheck.transport.settings import REPORT, Settings
 from rangecheck.transport.tracer import Tracer
 
@@ -36,8 +38,10 @@ _EACH_SHARE, _ALL_SHARE = 0.2, 0.5
 #: share that everything left out and interpolation of kept light may cost together: the noise that this saves is worth more
 _CACHE_SHARE = 0.8
 #: the estimate of the remaining noise is asked to stay this far below what is left
-_NOISE_SHARE = 0.8
+_NOISE_SHARE = 0.95
 _PILOT_PIXELS, _PILOT_PASSES = 2048, 8
+#: of a small picture the pilot sees one pixel in so many, but not fewer than these
+_ONE_IN, _FEWEST_PIXELS = 4, 320
 #: a form that may be off by more than this share of the peak is not tried
 _FORM_WORTH_A_TRY = 0.1
 _DEPTHS = (1, 2, 3, 4, 6, 10, 16)
@@ -140,7 +144,8 @@ class _Planner:
         self.tracer, self.picture, self.tolerance, self.seed = tracer, picture, tolerance, seed
         order = pixel_order(picture.camera.width, picture.camera.height)
         # blocks of 4 x 4 pixels, one from each of many equal stretches of the picture: spread over it, yet coherent
-        blocks, wanted = max(1, len(order) // 16), min(len(order) // 16, _PILOT_PIXELS // 16)
+        enough = min(_PILOT_PIXELS, max(len(order) // _ONE_IN, _FEWEST_PIXELS))
+        blocks, wanted = max(1, len(order) // 16), min(len(order) // 16, enough // 16)
         places = (np.arange(wanted) + np.random.default_rng(seed).random(wanted)) / max(wanted, 1) * blocks
         chosen = order[: blocks * 16].reshape(blocks, 16)[places.astype(int)] if wanted else order
         self.pixels: IntArray = np.ascontiguousarray(chosen.ravel())
@@ -262,28 +267,49 @@ class _Planner:
         self.reasons.append(f"depth: {_FULL_DEPTH} reflections; {_DEPTHS[-1]} would leave an error of {_percent(cost)}")
 
     def _irradiance(self) -> None:
-        """Diffuse interreflection looked up where it is kept on the surfaces, if interpolation is good enough; else followed path by path."""
+        """Diffuse interreflection looked up where it is kept on the surfaces, at the surface seen or one reflection on, if that is good enough
+        and cheaper than following paths."""
         if not self.settings.diffuse or self.tracer.materials.shiny.any():
             return
-        kept = self.tracer.irradiance(self.settings.depth, self.settings.records)
-        without = self._look(replace(self.settings, diffuse=False))
-        gathered = 0.5 * (self.seen[0] - without[0] + self.seen[1] - without[1])
-        covered = max(float((gathered > 0).mean()), 1e-3)
-        # the cache's error is relative to the light on the surfaces; a frame also has its background
-        cost = kept.error * float(gathered.mean()) / self.mean / math.sqrt(covered)
-        allowed = _CACHE_SHARE * self.tolerance - self.spent
-        seen = self._look(replace(self.settings, gather_diffuse="cache"))
-        gap = 0.5 * (seen[0] - self.seen[0] + seen[1] - self.seen[1])
-        shift, sure = abs(float(gap.mean())) / self.mean, 3.0 * float(gap.std()) / math.sqrt(gap.size) / self.mean
-        said = f"{kept.explain()}; {_percent(cost)} of the picture, its mean {_percent(shift)} from the paths' (known to {_percent(sure)})"
-        if cost <= allowed and shift <= sure + allowed:
-            self.settings, self.seen = replace(self.settings, gather_diffuse="cache"), seen
-            self.spent += cost
-            self.reasons.append(f"diffuse light: looked up; {said}; {_percent(allowed)} was allowed")
-        else:
+        tracer, pixels = self.tracer, self.picture.camera.width * self.picture.camera.height
+        records = records_for(pixels)
+        samples = self._samples_to_come()
+        keeping, following = rays_to_keep(tracer, records), rays_of_paths(tracer, pixels, samples)
+        if following < keeping:
             self.reasons.append(
-                f"diffuse light: followed path by path; kept on the surfaces: {said}; {_percent(allowed)} was allowed"
+                f"diffuse light: followed path by path, about {samples:.0f} samples a pixel and {following:.2g} rays; to keep it on the "
+                f"surfaces would take as long as {keeping:.2g}"
             )
+            return
+        kept = tracer.irradiance(self.settings.depth, records)
+        seen, looked_at = seen_places(tracer, self.picture, self.pixels)
+        if not len(seen.face):
+            return
+        allowed = _CACHE_SHARE * self.tolerance - self.spent
+        tried = []
+        for way, words, off in (
+            ("cache", "at the surface seen", partial(off_at_once, kept, seen, looked_at)),
+            ("second", "where rays of the surface seen arrive", partial(off_at_second, tracer, kept, seen, looked_at, self.seed)),
+        ):
+            cost = self._relative(*off())
+            tried.append(f"{words} {_percent(cost)} of the picture")
+            if cost <= allowed and (way == "cache" or self.settings.depth > 1):
+                self.settings = replace(self.settings, gather_diffuse=way, records=records)
+                self.seen = self._look(self.settings)
+                self.spent += cost
+                self.reasons.append(
+                    f"diffuse light: looked up {words}; {kept.explain()}; off by {', '.join(tried)}; {_percent(allowed)} was allowed"
+                )
+                return
+        self.reasons.append(
+            f"diffuse light: followed path by path; kept on the surfaces: {kept.explain()}; off by {', '.join(tried)}; "
+            f"{_percent(allowed)} was allowed"
+        )
+
+    def _samples_to_come(self) -> float:
+        """Samples a pixel that present settings would take, from how much the pilot's two looks differ."""
+        one = 0.5 * _PILOT_PASSES * float(((self.seen[0] - self.seen[1]) ** 2).mean())
+        return one / (_NOISE_SHARE * self.tolerance * self.mean) ** 2
 
     def _branches(self) -> None:
         """How many rays gather at the surface seen: as many as pay, by the variance inside a pixel with one and with four."""

@@ -8,7 +8,7 @@ from rangecheck.errors import SettingError
 
 GLINTS = ("ray", "corners", "fraction")
 GATHERS = ("order", "fan")
-DIFFUSE_WAYS = ("paths", "cache")
+DIFFUSE_WAYS = ("paths", "second", "cache")
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,8 @@ class Settings:
     spike, lobe, diffuse  whether surfaces mirror, gather over the lobe, gather over the hemisphere (light from sources
                     is always reflected by all three)
     lobe_rays, diffuse_rays  rays of each hit that the camera sees; later hits send one ray for all
-    gather_diffuse  over the hemisphere: `paths` rays of each hit, `cache` what is kept on the surfaces, gathered once for the scene (where
-                    nothing shines)
+    gather_diffuse  over the hemisphere: `paths` rays of each hit; `cache` what is kept on the surfaces, gathered once for the scene (where
+                    nothing shines); `second` rays of the surface seen, and at what they meet the light that is kept there
     records         places at which the light that is kept is gathered, before the surface's form asks for more
     depth           reflections followed at most; 1 is light straight from the sources
     least           paths that carry no more than this share are not followed (0: all are)
@@ -61,7 +61,7 @@ class Settings:
     @property
     def by_chance(self) -> bool:
         """Whether light is gathered by drawing directions, so that one sample tells little of its pixel."""
-        return self.lobe or (self.diffuse and self.gather_diffuse == "paths")
+        return self.lobe or (self.diffuse and self.gather_diffuse != "cache")
 
     def __post_init__(self) -> None:
         for name, low, high in (

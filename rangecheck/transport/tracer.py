@@ -86,10 +86,17 @@ class Tracer:
                 self._kept[depth, records] = kept
             return self._kept[depth, records]
 
-    def _stored(self, settings: Settings) -> Stored:
-        if settings.diffuse and settings.gather_diffuse == "cache":
-            return self.irradiance(settings.depth, settings.records).stored
-        return nothing_stored(self.scene.channels)
+    def _stored(self, settings: Settings) -> tuple[Stored, Stored]:
+        """What is kept where the camera looks, and where rays that gather meet surfaces."""
+        nothing = nothing_stored(self.scene.channels)
+        if (
+            not settings.diffuse
+            or settings.gather_diffuse == "paths"
+            or (settings.depth < 2 and settings.gather_diffuse == "second")
+        ):
+            return nothing, nothing
+        kept = self.irradiance(settings.depth, settings.records)
+        return (kept.stored, kept.stored) if settings.gather_diffuse == "cache" else (nothing, kept.everything)
 
     def lit_as(self, scene: Scene) -> Tracer:
         """The lights and materials of `scene`, whose surface and parts are the same."""
@@ -201,6 +208,8 @@ class _Chunk:
         self._tally = np.zeros((len(KIND_NAMES), settings.depth + 1, len(tracer.lights)))
         self._sample = work.samples(0)
         self._stored = tracer._stored(settings)
+        # the light of the sources is kept too
+        self._ends = settings.gather_diffuse == "second" and self._stored[1].sides > 0
 
     def shine(
         self, picture: PictureRays, pixels: IntArray, numbers: IntArray, seed: int
@@ -224,10 +233,10 @@ class _Chunk:
         self._cast(rays, n, coherent=reflections == 0)
         hits = self._work.hits(reflections, n)
         count = meet(
-            tracer.geometry, tracer.sources, tracer.surroundings, self._stored, rays, n, reflections,
+            tracer.geometry, tracer.sources, tracer.surroundings, self._stored[min(reflections, 1)], rays, n, reflections,
             settings.backdrop, reflections != 1 or settings.glints == "ray", hits, self._sample, self._tally,
         )  # fmt: skip
-        if count == 0 or reflections == settings.depth:
+        if count == 0 or reflections == settings.depth or (reflections == 1 and self._ends):
             return
         self._light(hits, count, reflections + 1)
         if reflections == 0 and settings.spike and settings.glints != "ray" and tracer.lights[1:]:
