@@ -66,6 +66,9 @@ class Simplify(click.ParamType):
 @click.option(
     "--print-up", type=Plane(3), metavar="X,Y,Z", help="Away from the build plate: the tilt for which it is proved to drain."
 )
+@click.option(
+    "--file-up", type=click.Choice(["z", "scan"]), help="z: STL and 3MF stand as slicers take them; scan: y up, as scanned."
+)
 @click.option("--printer", metavar="NAME", help="Judge it for printing by a profile of configs/printers, or a profile file.")
 @click.option("--orient", is_flag=True, help="Advise which way up to print: islands, overhang, largest layer, height.")
 @click.option("--ascii", is_flag=True, help="STL as text.")

@@ -15,7 +15,7 @@ from rangecheck.solid.opinions import disagreements, second_opinions
 from rangecheck.solid.printer import printer
 from rangecheck.solid.shape import shape_findings
 from rangecheck.surface import Surface
-from rangecheck.surface.mesh_files import read_mesh
+from rangecheck.surface.mesh_files import open_mesh, read_mesh
 
 #: file: boundary edges, non-manifold vertices, shells, faces that cross, findings that are errors; as trimesh and MeshLab agree
 DIRTY = {
@@ -87,6 +87,9 @@ def test_of_a_sound_solid_all_programs_say_the_same(tmp_path):
     opinions = second_opinions(tmp_path / "ring.stl", surface)
     assert [o.closed for o in opinions] == [True] * 4 and disagreements(surface, opinions, 1.0) == []
     assert opinions[2].facts["self_intersecting_faces"] == 0 and opinions[3].facts["genus"] == 1
+    # by their own readers, or given the file's records with equal corners welded: they say the same
+    records = open_mesh(tmp_path / "ring.stl", "mm").file_vertices
+    assert [o.facts for o in second_opinions(tmp_path / "ring.stl", surface, records=records)] == [o.facts for o in opinions]
 
 
 @pytest.mark.engines

@@ -13,6 +13,7 @@ from rangecheck.solid.hollow import hollow
 from rangecheck.solid.offset import inner_offset
 from rangecheck.solid.printer import printer
 from rangecheck.solid.simplify import printable_error_mm, simplify
+from rangecheck.solid.thickness import sample_surface, wall_thickness_mm
 from rangecheck.surface import INVENTED, MEASURED, Surface
 from rangecheck.surface import topology as topo
 
@@ -58,6 +59,26 @@ def test_without_drains_the_pocket_is_named_with_its_volume():
     made = hollow(Solid.from_surface(cube(20.0)), wall_mm=3.0, up=Z, drain_mm=0.0)
     assert made.drains == () and len(made.kept) == 1 and made.kept[0].closed
     assert made.kept[0].volume_mm3 == pytest.approx(14.0**3, rel=0.02) and "1 pockets keep" in made.notes[1]
+
+
+def test_the_wall_seen_from_outside_is_judged_where_the_shape_leaves_room_for_a_cavity():
+    wall = hollow(Solid.from_surface(cube(20.0)), wall_mm=3.0, up=Z, drain_mm=0.0, step_mm=0.5).wall
+    # on each side of the cube the cavity, a cube of 14 mm, is within 3.15 mm of a square of 14 mm widened by a rim
+    rim = np.sqrt(3.15**2 - 3.0**2)
+    room = (14**2 + 4 * 14 * rim + np.pi * rim**2) / 20**2
+    assert wall.outer_within > 0.97 and wall.full_share == pytest.approx(1 - room, abs=0.03)
+    assert wall.full[0][3] == pytest.approx(3 * np.sqrt(3), rel=0.15) and np.abs(wall.full[0][:3]).min() > 8
+
+
+def test_a_sharp_edge_is_thin_only_as_an_edge_and_a_blade_is_thin_all_over():
+    # a blade 10 mm long that rises from nothing to 1 mm
+    corners = [[0, 0, 0], [10, 0, -0.5], [10, 0, 0.5], [0, 8, 0], [10, 8, -0.5], [10, 8, 0.5]]
+    faces = [[0, 1, 2], [3, 5, 4], [0, 3, 4], [0, 4, 1], [0, 2, 5], [0, 5, 3], [1, 4, 5], [1, 5, 2]]
+    blade = Surface(corners, faces)
+    samples = sample_surface(blade, 0.1)
+    assert wall_thickness_mm(blade, samples).min() < 0.01
+    thick = wall_thickness_mm(blade, samples, edge_mm=0.5)
+    assert 0.04 < thick.min() < 0.06 and (thick < 0.5).mean() > 0.3
 
 
 def test_two_chambers_get_two_drains():

@@ -10,11 +10,13 @@ from test_topology_distance import CUBE_CORNERS, CUBE_FACES, cube
 from rangecheck.errors import NotSolid, OutputError
 from rangecheck.export.meshes import write_mesh
 from rangecheck.export.stl import as_float32, write_stl
+from rangecheck.rigid import move_points
 from rangecheck.solid import Solid
 from rangecheck.solid.rounding import collapse_flat_faces
 from rangecheck.surface import Surface
 from rangecheck.surface import topology as topo
 from rangecheck.surface.mesh_files import open_mesh, read_mesh
+from rangecheck.surface.standing import file_from_scans, lowered_in
 
 
 def test_a_written_solid_is_read_back_with_its_volume_and_the_same_bytes_each_time(tmp_path):
@@ -33,6 +35,32 @@ def test_normals_in_the_file_point_outwards(tmp_path):
     write_stl(Solid.from_surface(cube(2.0)), tmp_path / "c.stl")
     rows = np.frombuffer((tmp_path / "c.stl").read_bytes()[84:], np.dtype([("n", "<f4", 3), ("c", "<f4", (3, 3)), ("a", "<u2")]))
     assert (np.einsum("ij,ij->i", rows["n"], rows["c"].mean(axis=1)) > 0.9).all()
+
+
+@pytest.mark.parametrize("name", ["a.stl", "text.stl", "a.3mf"])
+def test_a_part_stands_on_its_base_for_slicers_and_is_read_in_its_own_frame_here(tmp_path, name):
+    import trimesh
+
+    # y up, and the front towards +z, as in the frame of scans; lengths that float32 says exactly
+    lying = Solid.from_surface(Surface(CUBE_CORNERS * [2.0, 5.0, 1.5] + [7.0, -20.25, 3.0], CUBE_FACES))
+    written = write_mesh(lying, tmp_path / name, stand=True, ascii=name == "text.stl")
+    (x0, y0, z0), (x1, y1, z1) = lying.surface.bounds_mm
+    seen = trimesh.load_mesh(tmp_path / name).bounds
+    np.testing.assert_array_equal(seen, [[x0, -z1, 0.0], [x1, -z0, y1 - y0]])
+    back = read_mesh(tmp_path / name, "mm")
+    np.testing.assert_array_equal(back.bounds_mm, lying.surface.bounds_mm)
+    assert back.volume_mm3 == pytest.approx(lying.volume_mm3)
+    motion = file_from_scans(written.lowered_mm)
+    corners = move_points(motion, lying.surface.vertices)
+    np.testing.assert_allclose([corners.min(axis=0), corners.max(axis=0)], seen)
+
+
+def test_the_head_of_a_standing_file_holds_every_digit_of_how_far_it_was_lowered(tmp_path):
+    far = -1.2345678901234567e-05
+    write_stl(Solid.from_surface(Surface(CUBE_CORNERS * 0.5 + [0.0, far, 0.0], CUBE_FACES)), tmp_path / "a.stl", stand=True)
+    head = (tmp_path / "a.stl").read_bytes()[:80]
+    assert lowered_in(head) == pytest.approx(far, abs=1e-15) and not head.startswith(b"solid")
+    assert lowered_in(b"solid written by somebody else, z up, lowered by 3") is None
 
 
 def test_only_a_solid_is_written_unless_an_open_file_is_forced(tmp_path):

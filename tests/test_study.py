@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 
 import pytest
 
@@ -23,6 +24,7 @@ from rangecheck.study import (
     write_study,
 )
 from rangecheck.study.charts import draw
+from rangecheck.study.memory import run_watched
 
 
 class Clock:
@@ -203,3 +205,11 @@ def test_a_study_of_parts_runs_those_asked_for_and_says_what_they_took():
     assert all(row["seconds"] >= 0 and row["peak_memory_mb"] > 1 for row in some.tables["parts"])
     with pytest.raises(SettingError, match="no part 'four'; its parts are one, two, three"):
         study(part="four")
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the memory of processes is read from /proc")
+def test_the_memory_of_a_command_is_that_of_all_it_starts():
+    child = "import time; held = bytearray(60_000_000); time.sleep(0.5)"
+    parent = f"import subprocess, sys; sys.exit(subprocess.run([sys.executable, '-c', {child!r}]).returncode + 3)"
+    status, peak = run_watched([sys.executable, "-c", parent])
+    assert status == 3 and 60 < peak < 200

@@ -11,7 +11,7 @@ import io
 import json
 import struct
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from rangecheck.export.stl import Exported, as_float32, proved_file, write_stl
 from rangecheck.files import whole_file
 from rangecheck.solid.rounding import collapse_flat_faces
 from rangecheck.solid.solid import Solid
+from rangecheck.surface.standing import file_from_scans, words
 from rangecheck.surface.surface import ORIGIN_NAMES, Surface
 
 SUFFIXES = (".ply", ".obj", ".off", ".glb", ".3mf", ".stl")
@@ -36,24 +37,26 @@ def write_mesh(
     force: bool = True,
     force_open: bool = False,
     ascii: bool = False,
+    stand: bool = False,
     severities: Mapping[str, str] | None = None,
 ) -> Exported | None:
     """Write a surface in mm to `path`, in the format of its ending, whole or not at all; same surface, same bytes. What was read back of an
-    STL or of a Solid is returned. `ascii` and `force_open` concern STL (see `write_stl`).
+    STL or of a Solid is returned. `ascii` and `force_open` concern STL (see `write_stl`); `stand` STL and 3MF, which slicers open with z up.
 
     Raises OutputError for an unknown ending, NotSolid for an STL of what is not a Solid and for a Solid that its file no longer says."""
     suffix = Path(path).suffix.lower()
     if suffix == ".stl":
-        return write_stl(surface, path, force=force, force_open=force_open, ascii=ascii, severities=severities)
+        return write_stl(surface, path, force=force, force_open=force_open, ascii=ascii, stand=stand, severities=severities)
     proved = isinstance(surface, Solid)
     shape = surface.surface if isinstance(surface, Solid) else surface
     moved = 0.0
+    lowered = float(shape.bounds_mm[0, 1]) if stand and suffix == ".3mf" else None
     if proved and suffix == ".glb":
         # GLB holds float32 like STL
         shape, moved = as_float32(shape)
         shape = collapse_flat_faces(shape)
     try:
-        content = {".ply": _ply, ".obj": _obj, ".off": _off, ".glb": _glb, ".3mf": _3mf}[suffix](shape)
+        content = _WRITERS[suffix](shape) if lowered is None else _3mf(shape, lowered)
     except KeyError:
         raise OutputError(path, f"ends in {suffix or 'nothing'}; a mesh ends in {', '.join(SUFFIXES)}") from None
     if not proved:
@@ -62,7 +65,7 @@ def write_mesh(
         return None
     with proved_file(path, force=force, must_be_solid=True, severities=severities) as (part, judged):
         part.write_bytes(content)
-    return Exported(Path(path), len(shape.faces), judged.verdict, moved, judged.surface)
+    return Exported(Path(path), len(shape.faces), judged.verdict, moved, judged.surface, lowered)
 
 
 def _ply(surface: Surface) -> bytes:
@@ -182,19 +185,21 @@ _3MF_LINKS = """<?xml version="1.0" encoding="UTF-8"?>
 """
 
 
-def _3mf(surface: Surface) -> bytes:
-    """A zip archive with one object; vertices keep the digits that tell their float64 values."""
+def _3mf(surface: Surface, lowered_mm: float | None = None) -> bytes:
+    """A zip archive with one object; vertices keep the digits that tell their float64 values, and the item's transform makes it stand."""
+    motion = np.eye(4) if lowered_mm is None else file_from_scans(lowered_mm)
+    placed = "" if lowered_mm is None else f' transform="{" ".join(f"{x!r}" for x in motion[:3].T.ravel().tolist())}"'
     shares = ", ".join(f"{name} {surface.share_of_area(k):.2%}" for k, name in enumerate(ORIGIN_NAMES))
     rows = [
         '<?xml version="1.0" encoding="UTF-8"?>',
         '<model unit="millimeter" xml:lang="en-US" xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02">',
-        '<metadata name="Application">rangecheck</metadata>',
+        f'<metadata name="Application">rangecheck{"" if lowered_mm is None else words(lowered_mm)}</metadata>',
         f'<metadata name="Description">share of area: {shares}</metadata>',
         '<resources><object id="1" type="model"><mesh><vertices>',
         *(f'<vertex x="{x!r}" y="{y!r}" z="{z!r}"/>' for x, y, z in surface.vertices.tolist()),
         "</vertices><triangles>",
         *(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in surface.faces.tolist()),
-        '</triangles></mesh></object></resources><build><item objectid="1"/></build></model>',
+        f'</triangles></mesh></object></resources><build><item objectid="1"{placed}/></build></model>',
     ]
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -206,3 +211,6 @@ def _3mf(surface: Surface) -> bytes:
             # a fixed date: the same solid gives the same bytes
             archive.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), text, zipfile.ZIP_DEFLATED)
     return stream.getvalue()
+
+
+_WRITERS: dict[str, Callable[[Surface], bytes]] = {".ply": _ply, ".obj": _obj, ".off": _off, ".glb": _glb, ".3mf": _3mf}

@@ -24,21 +24,25 @@ from rangecheck.solid.findings import Verdict
 from rangecheck.solid.rounding import collapse_flat_faces
 from rangecheck.solid.solid import Solid, check_solid
 from rangecheck.surface.mesh_files import open_mesh
+from rangecheck.surface.standing import standing, words
 from rangecheck.surface.surface import Surface
 
 _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _HEADER = b"binary STL, millimetres, written by rangecheck"
+_STANDING_HEADER = b"binary STL, mm, written by rangecheck"
 
 
 @dataclass(frozen=True)
 class Exported:
-    """What was written: the file, its faces, the check of its own bytes, the farthest that rounding moved a vertex, and what was read back."""
+    """What was written: the file, its faces, the check of its own bytes, the farthest that rounding moved a vertex, what was read back, and by how
+    much it was lowered where it stands as slicers take it (see surface/standing.py)."""
 
     path: Path
     faces: int
     verdict: Verdict
     moved_mm: float
     read_back: Surface = field(repr=False)
+    lowered_mm: float | None = None
 
 
 def write_stl(
@@ -48,15 +52,20 @@ def write_stl(
     force: bool = True,
     force_open: bool = False,
     ascii: bool = False,
+    stand: bool = False,
     severities: Mapping[str, str] | None = None,
 ) -> Exported:
-    """Write STL in mm, binary unless `ascii`, whole or not at all, and check what the file says.
+    """Write STL in mm, binary unless `ascii`, whole or not at all, and check what the file says. With `stand`, turned so that y becomes z,
+    upwards, and lowered onto z = 0, as slicers take it; the file says so, and is read here in the frame it came from.
 
     A Surface that is no Solid is refused with NotSolid unless `force_open`; then the verdict on its bytes is returned, not raised.
     `severities` overrides those of findings by code. Raises OutputError when the file cannot be written or exists and `force` is False."""
     surface = solid.surface if isinstance(solid, Solid) else solid
     if not isinstance(solid, Solid) and not force_open:
         raise NotSolid("only a Solid is exported as STL; make one with Solid.from_surface(), or force an open file", findings=())
+    lowered: float | None = None
+    if stand:
+        surface, lowered = standing(surface)
     rounded, moved = as_float32(surface)
     if isinstance(solid, Solid):
         rounded = collapse_flat_faces(rounded)
@@ -64,9 +73,9 @@ def write_stl(
         proved_file(path, force=force, must_be_solid=not force_open, severities=severities) as (part, judged),
         part.open("wb") as stream,
     ):
-        for piece in _pieces(rounded, ascii):
+        for piece in _pieces(rounded, ascii, lowered):
             stream.write(piece)
-    return Exported(Path(path), len(rounded.faces), judged.verdict, moved, judged.surface)
+    return Exported(Path(path), len(rounded.faces), judged.verdict, moved, judged.surface, lowered)
 
 
 def stl_bytes(surface: Surface, *, ascii: bool = False) -> bytes:
@@ -74,11 +83,12 @@ def stl_bytes(surface: Surface, *, ascii: bool = False) -> bytes:
     return b"".join(_pieces(surface, ascii))
 
 
-def _pieces(surface: Surface, ascii: bool) -> Iterator[bytes]:
+def _pieces(surface: Surface, ascii: bool, lowered_mm: float | None = None) -> Iterator[bytes]:
+    how = b"" if lowered_mm is None else words(lowered_mm).encode()
     if ascii:
-        yield b"solid rangecheck millimetres\n"
+        yield b"solid rangecheck mm" + how + b"\n" if how else b"solid rangecheck millimetres\n"
     else:
-        yield _HEADER.ljust(80, b" ") + np.uint32(len(surface.faces)).astype("<u4").tobytes()
+        yield (_STANDING_HEADER + how if how else _HEADER).ljust(80, b" ") + np.uint32(len(surface.faces)).astype("<u4").tobytes()
     for start in range(0, len(surface.faces), 1 << 18):
         records = _records(surface, slice(start, start + (1 << 18)))
         yield _facets(records) if ascii else records.tobytes()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rangecheck.arrays import FloatArray
 from rangecheck.config import Settings
@@ -16,12 +16,17 @@ from rangecheck.pipeline.health import versions
 from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.subject import eye_of, hashes, read_subject
 from rangecheck.progress import Reporter
+from rangecheck.rigid import inverse
 from rangecheck.solid import Solid, Verdict, check_solid, choose_base_height, untangle, verdict
 from rangecheck.solid.base import UP, trimmed
 from rangecheck.solid.closing import Closed, close_surface
 from rangecheck.solid.hollow import Hollow, hollow
 from rangecheck.solid.printer import Printer
 from rangecheck.surface import ORIGIN_NAMES, Surface
+from rangecheck.surface.standing import file_from_scans
+
+if TYPE_CHECKING:
+    from rangecheck.export.stl import Exported
 
 
 @dataclass
@@ -257,8 +262,11 @@ def solid(
         )
     with reporter.stage("exporting"):
         part = made.solid or made.surface
-        written = write_mesh(part, out, force=force, force_open=force_open, ascii=ascii, severities=settings.checking.severities)
-        plugs = _write_plugs(made, out, force)
+        stand = settings.solid.file_up == "z"
+        written = write_mesh(
+            part, out, force=force, force_open=force_open, ascii=ascii, stand=stand, severities=settings.checking.severities
+        )
+        plugs = _write_plugs(made, out, force, stand)
     fit = made.solid is not None
     if made.solid is not None and written is not None:
         near = weld_findings(written.read_back, severities=settings.checking.severities)
@@ -276,7 +284,14 @@ def solid(
     else:
         lines.append(f"{out}: written although it is no solid")
     lines += [f"{path}: plug" for path in plugs]
-    content |= {"output": out, "plugs": plugs, "fit": fit, "seconds": reporter.seconds, "decisions": reporter.notes}
+    content |= {
+        "output": out,
+        "standing": standing_of(written),
+        "plugs": plugs,
+        "fit": fit,
+        "seconds": reporter.seconds,
+        "decisions": reporter.notes,
+    }
     write_json(beside, content, force=force)
     return Outcome(content, [*lines, f"{beside}: what it was made of, and how"], fit)
 
@@ -317,13 +332,21 @@ def _areas(surface: Surface) -> dict[str, dict[str, float]]:
     }
 
 
-def _write_plugs(made: Made, out: str, force: bool) -> list[str]:
+def standing_of(written: Exported | None) -> dict[str, Any] | None:
+    """How a written file stands, for its JSON: the motions between its frame and that of the scans; None where they are the same."""
+    if written is None or written.lowered_mm is None:
+        return None
+    motion = file_from_scans(written.lowered_mm)
+    return {"up": "z", "file_from_scans": motion.tolist(), "scans_from_file": inverse(motion).tolist()}
+
+
+def _write_plugs(made: Made, out: str, force: bool, stand: bool) -> list[str]:
     from rangecheck.export.meshes import write_mesh
 
     paths = []
     for number, plug in enumerate(made.hollowed.plugs if made.hollowed else (), 1):
         path = Path(out).with_name(f"{Path(out).stem}_plug_{number}{Path(out).suffix}")
-        write_mesh(plug, path, force=force)
+        write_mesh(plug, path, force=force, stand=stand)
         paths.append(str(path))
     return paths
 

@@ -67,4 +67,4 @@ def check_mesh_file(
 
 
 def _asked(path: str | Path, read: MeshFile) -> Judges:
-    return Judges(path, read.surface, unit_mm=mm_per(read.unit), records=read.records)
+    return Judges(path, read.surface, records=read.file_vertices if read.records else None)

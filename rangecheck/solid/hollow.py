@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rangecheck.arrays import FloatArray
+from rangecheck.arrays import BoolArray, FloatArray
 from rangecheck.errors import SettingError, SurfaceError
 from rangecheck.modeler.engine import manifold3d_module
 from rangecheck.solid.drainage import Pocket, pockets
@@ -36,18 +36,21 @@ STEP = 0.3
 CLEARANCE_MM = 0.1
 #: drilling stops after this many drains; so many places without room for a cavity are listed
 MOST_DRAINS, MOST_PLACES = 12, 24
+#: steps up the slope of depth in search of room for a cavity
+CLIMBS = 6
 #: of the outside, from which the wall is measured
 MOST_SAMPLES = 200_000
 
 
 @dataclass(frozen=True)
 class Wall:
-    """The wall between cavity and outside, measured both ways.
+    """The wall between cavity and outside. At a place of either skin it is the distance to the nearest place of the other, as programs that
+    hollow by offset define it; measured from both.
 
     least_mm, median_mm, largest_mm, share_within  from the cavity to the outside, by the cavity's area; within `tolerance_mm` of `asked_mm`
-    outer_within  share of the outside's area from which the cavity is as far as was asked
-    full          places (x, y, z) of the outside, and their distance from the cavity, where the part's own shape leaves no room for one:
-                  edges, ears, noses; the farthest first, a few walls apart
+    outer_within  from the outside to the cavity: share within the tolerance of the area that leaves room for a cavity
+    full_share    share of the outside's area that leaves none: no place at least a wall deep lies within a wall and the tolerance of it
+    full          places (x, y, z) of that area, and their distance from the cavity: edges, ears, noses; the farthest first, a few walls apart
     """
 
     asked_mm: float
@@ -57,6 +60,7 @@ class Wall:
     tolerance_mm: float
     share_within: float
     outer_within: float = 1.0
+    full_share: float = 0.0
     full: tuple[tuple[float, float, float, float], ...] = ()
 
 
@@ -93,7 +97,8 @@ class Hollow:
         w = self.wall
         lines = [
             f"wall asked {w.asked_mm:g} mm; measured from the cavity {w.least_mm:.3f} to {w.largest_mm:.3f} mm, median {w.median_mm:.3f}, "
-            f"within {w.tolerance_mm:g} mm over {w.share_within:.2%} of its area; from outside over {w.outer_within:.1%}",
+            f"within {w.tolerance_mm:g} mm over {w.share_within:.2%} of its area; from outside over {w.outer_within:.2%} of what leaves room for "
+            f"it; {w.full_share:.1%} is too sharp or too thin for a cavity and stays thicker",
         ]
         if w.full:
             listed = ", ".join(f"({x:.1f}, {y:.1f}, {z:.1f}) {d:.1f} mm" for x, y, z, d in w.full[:6])
@@ -216,9 +221,10 @@ def measured_wall(outer: Surface, inner: Surface, asked_mm: float, tolerance_mm:
     cumulated = np.cumsum(samples.area_mm2[order])
     median = float(distance[order][np.searchsorted(cumulated, cumulated[-1] / 2)])
     within = float(samples.area_mm2[np.abs(distance - asked_mm) <= tolerance_mm].sum() / cumulated[-1])
-    outside = _evenly(sample_surface(outer, max(asked_mm, outer.extent_mm / 200)), MOST_SAMPLES)
+    outside = _evenly(sample_surface(outer, asked_mm / 4), MOST_SAMPLES)
     far, _ = SurfaceDistance(inner).distance_mm(outside.places_mm)
-    thick = far > asked_mm + tolerance_mm
+    room = _leaves_room(outer, outside, asked_mm, tolerance_mm)
+    thick = (far > asked_mm + tolerance_mm) & ~room
     full: list[tuple[float, float, float, float]] = []
     waiting = np.flatnonzero(thick)[np.argsort(-far[thick], kind="stable")]
     while len(waiting) and len(full) < MOST_PLACES:
@@ -226,8 +232,36 @@ def measured_wall(outer: Surface, inner: Surface, asked_mm: float, tolerance_mm:
         full.append((x, y, z, float(far[waiting[0]])))
         apart = np.linalg.norm(outside.places_mm[waiting] - outside.places_mm[waiting[0]], axis=1)
         waiting = waiting[apart > 8 * asked_mm]
-    share = float(outside.area_mm2[np.abs(far - asked_mm) <= tolerance_mm].sum() / outside.area_mm2.sum())
-    return Wall(asked_mm, float(distance.min()), median, float(distance.max()), tolerance_mm, within, share, tuple(full))
+    # what is as far as was asked had room, whatever the search for room says
+    good = np.abs(far - asked_mm) <= tolerance_mm
+    roomy = float(outside.area_mm2[room | good].sum())
+    share = float(outside.area_mm2[good].sum()) / roomy if roomy else 0.0
+    none = 1.0 - roomy / float(outside.area_mm2.sum())
+    return Wall(asked_mm, float(distance.min()), median, float(distance.max()), tolerance_mm, within, share, none, tuple(full))
+
+
+def _leaves_room(outer: Surface, samples: Samples, asked_mm: float, tolerance_mm: float) -> BoolArray:
+    """(n,) whether some place at least `asked_mm` deep lies within `asked_mm` and the tolerance of each sample: looked for straight below it,
+    then up the slope of depth from there."""
+    depth = SurfaceDistance(outer)
+    place = samples.places_mm - asked_mm * np.nan_to_num(outer.face_normals)[samples.face]
+    found = np.zeros(len(place), bool)
+    waiting = np.arange(len(place))
+    for _ in range(CLIMBS):
+        nearest = depth.nearest(place[waiting])
+        deep, _ = depth.signed_distance_mm(place[waiting])
+        lacks = asked_mm + deep
+        within = np.linalg.norm(place[waiting] - samples.places_mm[waiting], axis=1) <= asked_mm + tolerance_mm
+        # the depth that a place lacks is less than a hundredth of the tolerance: rounding of the climb, not of the shape
+        found[waiting[(lacks <= 0.01 * tolerance_mm) & within]] = True
+        on = (deep < 0) & (lacks > 0.01 * tolerance_mm) & within
+        away = place[waiting[on]] - nearest.place_mm[on]
+        length = np.linalg.norm(away, axis=1, keepdims=True)
+        place[waiting[on]] += lacks[on, None] * away / np.maximum(length, 1e-300)
+        waiting = waiting[on]
+        if not len(waiting):
+            break
+    return found
 
 
 def _evenly(samples: Samples, most: int) -> Samples:

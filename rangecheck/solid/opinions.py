@@ -55,9 +55,9 @@ class Judges:
     """trimesh, MeshLab and manifold3d, asked and thinking. `answers` waits for them; leaving the context ends whoever still thinks."""
 
     def __init__(
-        self, path: str | Path, surface: Surface, *, unit_mm: float = 1.0, records: bool = False, intersections: bool = True
+        self, path: str | Path, surface: Surface, *, records: FloatArray | None = None, intersections: bool = True
     ) -> None:
-        """Asks about `surface`, which was read from `path` in units of `unit_mm`; `records` says that the file is binary STL."""
+        """Asks about `surface`, which was read from `path`. Of binary STL, `records` (n, 3) are its vertices as the file has them."""
         self._own = Opinion(
             "rangecheck", topo.is_closed(surface), {"vertices": len(surface.vertices), "faces": len(surface.faces)}
         )
@@ -65,12 +65,7 @@ class Judges:
         self._running: list[subprocess.Popen[str]] = []
         self._pool = ThreadPoolExecutor(TOGETHER)
         welded = _saved(Path(self._folder.name) / "welded", surface, surface.vertices)
-        # a product of float32 by a unit, and back: rounding to float32 gives the bits of the file again
-        given = (
-            _saved(Path(self._folder.name) / "records", surface, (surface.vertices / unit_mm).astype(np.float32))
-            if records
-            else Path(path)
-        )
+        given = Path(path) if records is None else _saved(Path(self._folder.name) / "records", surface, records)
         meshlab = self._pool.submit(self._ask, "MeshLab", given, intersections)
         others = [self._pool.submit(self._ask, who, source) for who, source in (("trimesh", given), ("manifold3d", welded))]
         self._answers: list[Future[Opinion]] = [others[0], meshlab, others[1]]
@@ -96,7 +91,9 @@ class Judges:
         self._folder.cleanup()
 
 
-def second_opinions(path: str | Path, surface: Surface, *, records: bool = False, intersections: bool = True) -> list[Opinion]:
+def second_opinions(
+    path: str | Path, surface: Surface, *, records: FloatArray | None = None, intersections: bool = True
+) -> list[Opinion]:
     """Our opinion of `surface` in mm, which was read from `path`, then those of trimesh, MeshLab and manifold3d."""
     with Judges(path, surface, records=records, intersections=intersections) as judges:
         return judges.answers()

@@ -173,7 +173,7 @@ def _walls(
 ) -> list[Finding]:
     least = printer.least_wall_mm(float(np.ptp(local, axis=0).sum()))
     samples = sample_surface(surface, max(surface.extent_mm / 100, least))
-    wall = wall_thickness_mm(surface, samples)
+    wall = wall_thickness_mm(surface, samples, edge_mm=printer.feature_mm)
     thin = wall < least * (1 - 1e-6)
     finite = np.isfinite(wall)
     facts |= {"least_wall_allowed_mm": least, "least_wall_mm": float(wall[finite].min()) if finite.any() else None}

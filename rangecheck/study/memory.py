@@ -13,7 +13,7 @@ from pathlib import Path
 
 _PROC = Path("/proc")
 #: seconds between two looks
-_PERIOD_S = 0.05
+_PERIOD_S = 0.1
 
 
 def run_watched(command: Sequence[str]) -> tuple[int, float]:

@@ -7,6 +7,8 @@ dropped or turned.
 
 from __future__ import annotations
 
+import io
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +18,7 @@ from rangecheck.arrays import FloatArray, IntArray, mm_per
 from rangecheck.errors import DependencyMissing, InputError, UnitMissing
 from rangecheck.files import read_bytes
 from rangecheck.surface.ply_files import ply_mesh
+from rangecheck.surface.standing import lowered_in, turned_back
 from rangecheck.surface.stl_files import stl_corners
 from rangecheck.surface.surface import Surface
 from rangecheck.surface.weld import weld_exactly
@@ -28,12 +31,14 @@ _UNITS_3MF = {"micron": "um", "millimeter": "mm", "centimeter": "cm", "meter": "
 @dataclass(frozen=True)
 class MeshFile:
     """A mesh file that was read: its surface in mm, its format and unit, what was odd about it, in sentences, and whether it is
-    binary STL, whose records of float32 corners leave nothing to interpret."""
+    binary STL, whose records of float32 corners leave nothing to interpret. `file_vertices` (n, 3) are those of the surface as they stand in the
+    file, in its own unit and frame."""
 
     surface: Surface
     format: str
     unit: str
     notes: tuple[str, ...]
+    file_vertices: FloatArray
     records: bool = False
 
 
@@ -77,7 +82,23 @@ def open_mesh(path: str | Path, unit: str | None = None) -> MeshFile:
         raise UnitMissing(path)
     if kind != "stl":
         vertices, faces = _welded(vertices, faces, notes)
-    return MeshFile(Surface(vertices * mm_per(unit), faces, part_names=(path.stem,)), kind, unit, tuple(notes), records)
+    own = vertices
+    lowered = lowered_in(_head(content, kind))
+    if lowered is not None:
+        vertices = turned_back(vertices, lowered)
+        notes.append("it stands with z up, as slicers take it; read in the frame of its scans, y up")
+    return MeshFile(Surface(vertices * mm_per(unit), faces, part_names=(path.stem,)), kind, unit, tuple(notes), own, records)
+
+
+def _head(content: bytes, kind: str) -> bytes:
+    """Where a file for slicers says how it stands."""
+    if kind == "stl":
+        return content[:80]
+    if kind != "3mf":
+        return b""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        names = [name for name in archive.namelist() if name.lower().endswith(".model")]
+        return archive.open(names[0]).read(2000) if names else b""
 
 
 def _format(path: Path, content: bytes) -> str:
@@ -167,8 +188,6 @@ def _off(path: Path, content: bytes) -> tuple[FloatArray, IntArray]:
 
 def _through_trimesh(path: Path, content: bytes, kind: str) -> tuple[FloatArray, IntArray, str]:
     """Vertices, faces and unit of GLB or 3MF, all instances placed by their transforms."""
-    import io
-
     try:
         import trimesh
     except ImportError:
