@@ -29,7 +29,7 @@ from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.page import contours_of, keep_for_report, page_of
 from rangecheck.pipeline.preparing import prepared
 from rangecheck.pipeline.scanning import refused
-from rangecheck.pipeline.shape import findings_lines, solid_of
+from rangecheck.pipeline.shape import findings_lines, solid_of, standing_of
 from rangecheck.pipeline.subject import Subject, eye_of, hashes, read_all_scans, surface_of
 from rangecheck.pipeline.turning import Rendered, render_turntable
 from rangecheck.pipeline.views import map_at, orbit_of
@@ -91,11 +91,12 @@ def run(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None,
         (folder / "bust.stl").unlink(missing_ok=True)
         if made is not None and judged.fit:
             with reporter.stage("exporting STL"):
-                written = write_stl(made, folder / "bust.stl")
+                written = write_stl(made, folder / "bust.stl", stand=settings.solid.file_up == "z")
             stl = {
                 "file": "bust.stl",
                 "faces": written.faces,
                 "moved_by_rounding_mm": written.moved_mm,
+                "standing": standing_of(written),
                 "verdict": written.verdict.to_dict(),
             }
         else:
