@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from rangecheck.animation import (
     speckle_of,
     verdict_for,
 )
+from rangecheck.animation.consistency import Outline
 from rangecheck.config import Settings
 from rangecheck.export.mapped import coloured_map
 from rangecheck.export.pictures import write_png
@@ -41,12 +43,18 @@ NAMED = 10
 PRINTER = "prusa-sl1s"
 
 
-def judge(
-    surface: Surface, scans: Sequence[RangeScan], orbit: Orbit, settings: Settings, frames: Iterable[npt.NDArray[np.uint8]] = ()
-) -> tuple[dict[str, Any], list[str], list[npt.NDArray[np.uint8]]]:
-    """JSON-ready numbers, lines for people, and pictures of the flagged places from the sides that show most of them.
+@dataclass(frozen=True)
+class Known:
+    """What a surface and its scans tell of a turntable before any of its frames is made: slopes, outlines, views of the orbit, and drawings."""
 
-    `frames` are pictures of the turntable in a material that mirrors."""
+    found: Consistency
+    outlines: dict[str, Outline]
+    views: int
+    drawn: list[npt.NDArray[np.uint8]]
+
+
+def known_of(surface: Surface, scans: Sequence[RangeScan], orbit: Orbit, settings: Settings) -> Known:
+    """Everything of `judge` that needs no frames."""
     camera = PinholeCamera.from_field_of_view(VIEW_PX, VIEW_PX, settings.picture.field_of_view_deg)
     caster = EmbreeCaster(surface.vertices, surface.faces)
     step = max(1, orbit.frames // VIEWS)
@@ -55,16 +63,27 @@ def judge(
     # a pixel sees one facet of several; those between are seen as well
     seen = _near_seen(surface, faces_seen(views, len(surface.faces)))
     found = measure_consistency(surface, seen, most=JUDGED)
-    speckle = speckle_of(frames)
     outlines = {scan.name: outline_of(surface, scan, caster) for scan in scans}
+    return Known(found, outlines, len(views), _drawn(surface, found, views))
+
+
+def judge(
+    surface: Surface, scans: Sequence[RangeScan], orbit: Orbit, settings: Settings, frames: Iterable[npt.NDArray[np.uint8]] = (),
+    known: Known | None = None,
+) -> tuple[dict[str, Any], list[str], list[npt.NDArray[np.uint8]]]:  # fmt: skip
+    """JSON-ready numbers, lines for people, and pictures of the flagged places from the sides that show most of them.
+
+    `frames` are pictures of the turntable in a material that mirrors; `known` saves measuring what needs none."""
+    known = known or known_of(surface, scans, orbit, settings)
+    speckle = speckle_of(frames)
     machine = printer(settings.solid.printer or PRINTER)
     height = float(np.ptp(surface.bounds_mm[:, 1]))
     wanted = settings.solid.height_mm or height
-    said = verdict_for(found, height, wanted, machine.layer_mm, machine.pixel_mm)
-    content = _content(found, speckle, outlines, machine) | {
-        "height_mm": wanted, "fit": said.fit, "verdict": said.sentence, "views": len(views),
+    said = verdict_for(known.found, height, wanted, machine.layer_mm, machine.pixel_mm)
+    content = _content(known.found, speckle, known.outlines, machine) | {
+        "height_mm": wanted, "fit": said.fit, "verdict": said.sentence, "views": known.views,
     }  # fmt: skip
-    return content, _lines(found, speckle, outlines, said.sentence), _drawn(surface, found, views)
+    return content, _lines(known.found, speckle, known.outlines, said.sentence), known.drawn
 
 
 def _near_seen(surface: Surface, seen: Any) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -18,8 +19,8 @@ Measured = RangeScan | PointCloud
 
 @dataclass(frozen=True)
 class Prepared:
-    """Scans that may become a surface, and what was done and found: `registration` and `quality` are JSON-ready, or None;
-    `refined` and `refining`: what shading refined, and what is said of it."""
+    """Scans that may become a surface, and what was done and found: `registration` and `quality` are JSON-ready, or None; `worth` is the
+    quality and its lines where they are still being measured (see `whole`); `refined` and `refining`: what shading refined, and what is said of it."""
 
     scans: list[Measured]
     filtered: list[str] = field(default_factory=list)
@@ -28,6 +29,14 @@ class Prepared:
     quality_lines: list[str] = field(default_factory=list)
     refined: list[Any] = field(default_factory=list)
     refining: list[dict[str, Any]] = field(default_factory=list)
+    worth: Future[tuple[dict[str, Any] | None, list[str]]] | None = None
+
+    def whole(self) -> Prepared:
+        """The same with its quality, which is waited for."""
+        if self.worth is None:
+            return self
+        facts, lines = self.worth.result()
+        return replace(self, quality=facts, quality_lines=lines, worth=None)
 
     @property
     def grids(self) -> list[RangeScan]:
@@ -35,8 +44,10 @@ class Prepared:
         return [scan for scan in self.scans if isinstance(scan, RangeScan)]
 
 
-def prepared(scans: Sequence[Measured], settings: Settings, reporter: Reporter, *, quality: bool = False) -> Prepared:
-    """The scans, ready to be meshed. With `quality`, also what they are worth.
+def prepared(
+    scans: Sequence[Measured], settings: Settings, reporter: Reporter, *, quality: bool = False, aside: Executor | None = None
+) -> Prepared:
+    """The scans, ready to be meshed. With `quality`, also what they are worth: measured `aside`, where there is such a thread, while others work.
 
     Raises PosesRefused when they could not be shown to belong together and the settings do not allow leaving any out."""
     from rangecheck.scan.registration.samples import Samples, samples_of
@@ -67,9 +78,14 @@ def prepared(scans: Sequence[Measured], settings: Settings, reporter: Reporter, 
         grids, report = _placed(grids, samples, settings, reporter)
     facts: dict[str, Any] | None = None
     lines: list[str] = []
+    worth = None
     if quality:
-        facts, lines = _worth(grids, None if report and report["left_out"] else samples, settings, reporter)
-    return Prepared([*_with_noise(grids, reporter), *clouds], filtered, report, facts, lines, done, refining)
+        known = None if report and report["left_out"] else samples
+        if aside is None:
+            facts, lines = _worth(grids, known, settings, reporter)
+        else:
+            worth = aside.submit(_worth, grids, known, settings, Reporter())
+    return Prepared([*_with_noise(grids, reporter), *clouds], filtered, report, facts, lines, done, refining, worth)
 
 
 def _filtered(scans: list[RangeScan], settings: Settings, reporter: Reporter) -> tuple[list[RangeScan], list[str]]:
