@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -41,6 +41,11 @@ class Guess:
     correlation_um: float = 2.0
     wavelength_um: float = 0.555
     masking: str = "smith"
+
+    def but(self, **numbers: float) -> Guess:
+        """The same with some numbers changed."""
+        known: dict[str, Any] = dict(numbers)
+        return replace(self, **known)
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +195,7 @@ class Problem:
         for p, value in zip(self.parameters(), theta):
             value = float(value)
             if p.kind == "strength":
-                material = replace(material, **{p.name: value})  # type: ignore[arg-type]
+                material = material.but(**{p.name: value})
             elif p.kind == "log strength":
                 material = replace(material, K_lobe=max(material.K_lobe, LEAST_LOBE) * math.exp(value))
             elif p.kind == "length":

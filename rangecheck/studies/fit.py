@@ -23,6 +23,8 @@ from rangecheck.study import Candidate, Line, LineChart, SpeedChart, Study, meas
 
 PARTS = ("coverage", "speed", "pictures", "noise", "limits", "refine")
 NOISE = 0.01
+#: the first of the seeds on which coverage is judged: none of them was looked at while the method was made
+_FRESH = 41000
 _FAR_MM, _WAVE_UM = 1e6, 0.555
 _TITLE = "Material and lamp from photographs: honesty of the intervals, time, and limits"
 
@@ -88,9 +90,9 @@ def truths(found: Fitted, at_truth: Problem) -> dict[str, float]:
 
 
 def _coverage(quick: bool) -> tuple[list[Any], list[str], list[dict[str, Any]]]:
-    scenes, size = (20, 64) if quick else (200, 96)
+    scenes, size = (20, 48) if quick else (200, 64)
     rows: list[dict[str, Any]] = []
-    for seed in range(scenes):
+    for seed in range(_FRESH, _FRESH + scenes):
         put, at_truth = random_scene(seed, size)
         found = fit(put)
         known = truths(found, at_truth)
@@ -124,8 +126,8 @@ def _coverage(quick: bool) -> tuple[list[Any], list[str], list[dict[str, Any]]]:
 
 
 def _speed(quick: bool) -> tuple[list[Any], list[str], list[dict[str, Any]]]:
-    sizes = (64, 128) if quick else (64, 128, 256, 512)
-    scenes = 3 if quick else 9
+    sizes = (64, 128) if quick else (64, 256, 512)
+    scenes = 3 if quick else 7
     rows: list[dict[str, Any]] = []
     fit(random_scene(0, 64)[0])
     for size in sizes:
@@ -151,7 +153,7 @@ def _speed(quick: bool) -> tuple[list[Any], list[str], list[dict[str, Any]]]:
         for s in sizes
     ]
     put, at_truth = random_scene(1001, sizes[-1] // 2)
-    counts = (500, 3000) if quick else (300, 1000, 3000, 10000)
+    counts = (500, 3000) if quick else (300, 1000, 3000)
     candidates = [Candidate("pixels of the starts", str(c), lambda c=c: fit(put, pixels=c)) for c in counts]  # type: ignore[misc]
     measured = measure(candidates, lambda found: _wrong(found, at_truth), rounds=1 if quick else 3)
     charts.append(

@@ -100,7 +100,7 @@ def refinement(quick: bool) -> tuple[list[Any], list[str], list[dict[str, Any]]]
     rows: list[dict[str, Any]] = []
     findings: list[str] = []
     for azimuth, spots in cases:
-        made, scan = bust_picture(azimuth, 11 + int(azimuth), spots=spots, step=step)
+        made, scan = bust_picture(azimuth, round(111 + azimuth), spots=spots, step=step)
         name = f"{azimuth:g} degrees, {spots if spots else 'no'} painted spots"
         row: dict[str, Any] = {"azimuth_deg": azimuth, "spots": spots, "cells_of_scan": int(scan.valid.sum())}
         try:

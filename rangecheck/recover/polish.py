@@ -1,0 +1,194 @@
+"""Reweighted Gauss-Newton on all pixels (Huber 1964), and the statistics of where it ends."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from rangecheck.arrays import BoolArray, FloatArray
+from rangecheck.errors import SceneError
+from rangecheck.recover.identify import Determination, determine
+from rangecheck.recover.problem import LEAST_LOBE, Parameter, Problem
+from rangecheck.recover.residuals import BEND, OUTLIER, moved_sights, residuals
+
+#: standard deviations on either side of a 95 % interval
+TWO_SIDED_95 = 1.959963984540054
+_POLISH, _SETTLED, _LITTLE = 25, 0.03, 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """One parameter: value in its own unit (lengths and strengths as such), its 95 % interval, or None where it is not determined."""
+
+    name: str
+    value: float
+    low: float | None
+    high: float | None
+    at_bound: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """The outcome of a fit.
+
+    problem     with its state at the best parameters;  theta (p,) those, as `Problem.parameters` of `started` counts them
+    estimates   one for each parameter;  determination: covariance and what is not determined
+    scale       residuals' robust standard deviation in units of the stated noise: 1 where the model explains the pictures
+    rms         of the residuals that were kept, parts of full scale;  outliers: share of the pixels left out
+    cost        robust minus log likelihood, up to a constant
+    converged   whether the last step was small beside the intervals;  evaluations of the model on all pixels
+    """
+
+    started: Problem
+    problem: Problem
+    theta: FloatArray
+    parameters: list[Parameter]
+    estimates: list[Estimate]
+    determination: Determination
+    scale: float
+    rms: float
+    outliers: float
+    cost: float
+    converged: bool
+    evaluations: int
+
+    @property
+    def statements(self) -> tuple[str, ...]:
+        """What the pictures cannot determine."""
+        return self.determination.statements
+
+    def estimate(self, name: str) -> Estimate:
+        """The estimate of one parameter by name. Raises SceneError where it was not fitted."""
+        for estimate in self.estimates:
+            if estimate.name == name:
+                return estimate
+        raise SceneError(f"{name} was not fitted; there are {', '.join(e.name for e in self.estimates)}")
+
+
+def polish(problem: Problem, *, known_noise: bool = True) -> Fitted:
+    """Reweighted Gauss-Newton steps on all pixels from the problem's state, and the statistics of where they end."""
+    parameters = problem.parameters()
+    low, high = np.array([p.low for p in parameters]), np.array([p.high for p in parameters])
+    theta = np.clip(problem.start(), low, high)
+    free = np.ones(len(parameters), bool)
+    converged, damping = False, 0.0
+    normal, score, meat, cost, facts = accumulate(problem, theta)
+    evaluations = 1
+    for _ in range(_POLISH):
+        free = ~(((theta <= low) & (score > 0.0)) | ((theta >= high) & (score < 0.0)))
+        step, spread = _step(normal, score, free, parameters, damping)
+        moved = np.clip(theta + step, low, high)
+        trial = accumulate(problem, moved)
+        evaluations += 1
+        if trial[3] > cost * (1.0 + 1e-12) + 1e-9:
+            damping = max(10.0 * damping, 1e-3)
+            if damping > 1e6:
+                break
+            continue
+        # along what the pictures do not fix there is no end to walk to: little gained is the end too
+        small = bool((np.abs(moved - theta)[free] < _SETTLED * spread[free]).all()) or cost - trial[3] < _LITTLE
+        theta, damping = moved, 0.1 * damping if damping > 1e-6 else 0.0
+        normal, score, meat, cost, facts = trial
+        if small:
+            converged = True
+            break
+    scale, rms, outliers = facts
+    free = ~(((theta <= low) & (score > 0.0)) | ((theta >= high) & (score < 0.0)))
+    widen = 1.0 if known_noise else max(1.0, scale) ** 2
+    chosen = [p for p, f in zip(parameters, free) if f]
+    determination = determine(normal[np.ix_(free, free)], meat[np.ix_(free, free)], chosen)
+    covariance = np.zeros((len(parameters), len(parameters)))
+    covariance[np.ix_(free, free)] = determination.covariance * widen
+    known = np.zeros(len(parameters), bool)
+    known[free] = determination.determined
+    estimates = [estimate_of(problem, p, float(t), float(c), bool(k), bool(f)) for p, t, c, k, f in zip(
+        parameters, theta, np.sqrt(np.diag(covariance)), known, free)]  # fmt: skip
+    state, poses = problem.at(theta)
+    whole = determination._replace(covariance=covariance, determined=known)
+    return Fitted(
+        problem,
+        moved_sights(state, poses),
+        theta,
+        parameters,
+        estimates,
+        whole,
+        scale,
+        rms,
+        outliers,
+        cost,
+        converged,
+        evaluations,
+    )
+
+
+def _step(
+    normal: FloatArray, score: FloatArray, free: BoolArray, parameters: list[Parameter], damping: float
+) -> tuple[FloatArray, FloatArray]:
+    """Gauss-Newton step in the free parameters, kept within a unit each, and their standard deviations."""
+    units = np.array([p.unit for p in parameters])
+    scaled = (normal * units[:, None] * units[None, :])[np.ix_(free, free)]
+    # a prior of ten units keeps combinations that nothing fixes where they are
+    scaled = scaled + np.eye(len(scaled)) * 0.01 + np.diag(np.diag(scaled)) * damping
+    step, spread = np.zeros(len(units)), np.full(len(units), np.inf)
+    solved = np.linalg.solve(scaled, -(score * units)[free])
+    step[free] = np.clip(solved, -1.0, 1.0) * units[free]
+    spread[free] = np.sqrt(np.maximum(np.diag(np.linalg.inv(scaled)), 0.0)) * units[free]
+    return step, spread
+
+
+def accumulate(
+    problem: Problem, theta: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, float, tuple[float, float, float]]:
+    """Information matrix, score, scatter of the score, cost, and (scale, rms, outliers) over all pictures at `theta`."""
+    p = len(theta)
+    normal, meat, score = np.zeros((p, p)), np.zeros((p, p)), np.zeros(p)
+    cost, outliers, count, squares = 0.0, 0, 0, 0.0
+    sizes = []
+    for k, photo in enumerate(problem.photographs):
+        r, jacobian = residuals(problem, theta, k)
+        size = np.abs(r)
+        inside, linear = size < OUTLIER, size < BEND
+        psi = np.where(inside, np.clip(r, -BEND, BEND), 0.0)
+        bent = jacobian * linear[:, None]
+        normal += bent.T @ jacobian
+        weighed = jacobian * psi[:, None]
+        meat += weighed.T @ weighed
+        score += jacobian.T @ psi
+        capped = np.minimum(size, OUTLIER)
+        cost += float(np.where(linear, 0.5 * r * r, BEND * capped - 0.5 * BEND**2).sum())
+        outliers += int((~inside).sum())
+        count += len(r)
+        squares += float(((r * photo.noise)[inside] ** 2).sum())
+        sizes.append(size)
+    scale = float(np.median(np.concatenate(sizes)) / 0.6744897501960817)
+    rms = math.sqrt(squares / max(1, count - outliers))
+    return normal, score, meat, cost, (scale, rms, outliers / max(1, count))
+
+
+def in_own_unit(problem: Problem, p: Parameter, theta: float) -> float:
+    """A parameter as what it stands for: lengths, strengths, distances themselves instead of their logarithms."""
+    match p.kind:
+        case "length":
+            base = getattr(problem.material, p.name)
+        case "log strength":
+            base = max(problem.material.K_lobe, LEAST_LOBE)
+        case "irradiance":
+            base = problem.lights[p.owner].irradiance
+        case "distance":
+            base = problem.lights[p.owner].distance_mm
+        case "radius":
+            base = problem.lights[p.owner].angular_radius_deg
+        case "exposure":
+            base = problem.photographs[p.owner].exposure
+        case _:
+            return theta
+    return float(base * math.exp(theta))
+
+
+def estimate_of(problem: Problem, p: Parameter, theta: float, spread: float, known: bool, free: bool) -> Estimate:
+    """A parameter in its own unit with its interval."""
+    reach = TWO_SIDED_95 * spread
+    value, low, high = (in_own_unit(problem, p, theta + t) for t in (0.0, -reach, reach))
+    return Estimate(p.name, value, low if known else None, high if known else None, not free)

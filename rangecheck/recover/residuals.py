@@ -1,0 +1,64 @@
+"""Residuals of photographs against a model's state, in units of their noise.
+
+A pixel at saturation says only that the light was at least so much: its probability is that of the noise carrying the model's light past
+saturation (Tobin 1958), and its residual r is the one whose r^2/2 is minus the logarithm of that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from rangecheck.arrays import FloatArray
+from rangecheck.recover.problem import Problem
+
+#: Huber's bend and the limit beyond which a pixel counts as an outlier, in standard deviations of its noise
+BEND, OUTLIER = 2.5, 6.0
+
+
+def residuals(problem: Problem, theta: FloatArray, which: int, *, slopes: bool = True) -> tuple[FloatArray, FloatArray]:
+    """(predicted - measured) / noise (n,) of one picture, and its derivatives (n, p)."""
+    photo = problem.photographs[which]
+    shown = problem.predict(theta, which, slopes=slopes)
+    residual = (shown.values - photo.values) / photo.noise
+    jacobian = shown.slopes / photo.noise[:, None]
+    full = np.flatnonzero(photo.values >= photo.saturation)
+    if len(full):
+        residual[full], steep = at_least(residual[full])
+        jacobian[full] *= steep[:, None]
+    return residual, jacobian
+
+
+def at_least(excess: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Residual of a pixel known only to lie above saturation, and its slope by `excess`, (model - saturation) / noise."""
+    from scipy.special import log_ndtr
+
+    log_chance = log_ndtr(excess)
+    residual = -np.sqrt(np.maximum(-2.0 * log_chance, 1e-300))
+    hazard = np.exp(-0.5 * excess**2 - log_chance) / np.sqrt(2.0 * np.pi)
+    return residual, -hazard / residual
+
+
+def robust_cost(problem: Problem, theta: FloatArray) -> float:
+    """Huber's minus log likelihood of all pictures."""
+    total = 0.0
+    for k in range(len(problem.photographs)):
+        r = np.abs(residuals(problem, theta, k, slopes=False)[0])
+        total += float(np.where(r < BEND, 0.5 * r * r, BEND * r - 0.5 * BEND**2).sum())
+    return total
+
+
+def moved_sights(state: Problem, poses: FloatArray) -> Problem:
+    """The state with each picture's sight moved by its pose's small turn and shift (first order)."""
+    photographs = []
+    for photo, pose in zip(state.photographs, poses):
+        if pose.any():
+            sight = photo.sight
+            moved = sight.by_pose @ pose
+            normals, views = sight.normals + moved[:, 1], sight.views + moved[:, 2]
+            normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+            views /= np.linalg.norm(views, axis=1, keepdims=True)
+            photo = replace(photo, sight=replace(sight, points=sight.points + moved[:, 0], normals=normals, views=views))
+        photographs.append(photo)
+    return replace(state, photographs=tuple(photographs))
