@@ -72,7 +72,7 @@ class Simplify(click.ParamType):
 @click.option("--printer", metavar="NAME", help="Judge it for printing by a profile of configs/printers, or a profile file.")
 @click.option("--orient", is_flag=True, help="Advise which way up to print: islands, overhang, largest layer, height.")
 @click.option("--ascii", is_flag=True, help="STL as text.")
-@click.option("--force-open", is_flag=True, help="Write it even if it is no solid.")
+@click.option("--force-open", is_flag=True, help="Write STL even of what is no solid.")
 @common("out_file", "unit", "config", "set", "force")
 def command(mesh, out, unit, config, assignments, force, orient, ascii, force_open, reporter, **wanted):
     """Close, repair, base, hollow and simplify a mesh so that it can be built; export it.

@@ -232,6 +232,8 @@ def test_what_is_no_solid_is_written_only_when_forced_and_severities_can_be_over
         "solid", tmp_path / "flat.ply", "--unit", "mm", "-o", tmp_path / "flat.stl", "--close", "repair", "--force-open", "-q"
     )
     assert forced.return_value == 1 and (tmp_path / "flat.stl").exists()
+    other = run("solid", tmp_path / "flat.ply", "--unit", "mm", "-o", tmp_path / "flat.3mf", "--force-open", "-q")
+    assert "--force-open is for" in str(other.exception) and not (tmp_path / "flat.3mf").exists()
     crumbs = join([cube(10.0), cube(0.5, (20, 0, 0))])
     write_mesh(crumbs, tmp_path / "crumbs.ply")
     check = ("check", tmp_path / "crumbs.ply", "--unit", "mm", "-q")

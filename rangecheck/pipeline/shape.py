@@ -240,6 +240,8 @@ def solid(
 
     if Path(out).suffix.lower() not in SUFFIXES:
         raise OutputError(out, f"ends in {Path(out).suffix or 'nothing'}; a mesh ends in {', '.join(SUFFIXES)}")
+    if force_open and Path(out).suffix.lower() != ".stl":
+        raise OutputError(out, "is no STL; --force-open is for a slicer that mends by itself, and other formats hold solids only")
     check_writable(out)
     beside = Path(f"{out}.json")
     for target in (Path(out), beside):

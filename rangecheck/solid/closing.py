@@ -7,15 +7,13 @@ close without running through the sheet, so it gets a skirt and a back; everythi
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from rangecheck.errors import SettingError, SurfaceError
-from rangecheck.solid.findings import Verdict
 from rangecheck.solid.relief import close_relief
-from rangecheck.solid.repair import MAX_MOVE_MM, MAX_VANISHED, Step, compared, leash, repair
+from rangecheck.solid.repair import MAX_MOVE_MM, MAX_VANISHED, Repaired, Step, leash, repair
 from rangecheck.solid.solid import Solid, check_solid
 from rangecheck.surface.surface import Surface
 from rangecheck.surface.topology import is_closed
@@ -28,32 +26,16 @@ LONGEST_LEASH = 0.002
 
 
 @dataclass(frozen=True, eq=False)
-class Closed:
-    """A surface closed as far as it went.
+class Closed(Repaired):
+    """A surface closed as far as it went, proved nowhere but judged in `after`.
 
-    surface       the result, proved nowhere but judged in `after`
     way, reason   "repair" or "relief", and why
-    steps         what was done; refused: what was not, and why
-    moved_mm      farthest way between what was given and what is left of it, outside filled faces
-    vanished      share of the given area that is gone
-    before, after verdicts
     solid         the surface as it was proved, where that was done on the way
     """
 
-    surface: Surface
-    way: str
-    reason: str
-    steps: tuple[Step, ...]
-    refused: tuple[str, ...]
-    moved_mm: float
-    vanished: float
-    before: Verdict = field(repr=False)
-    after: Verdict = field(repr=False)
+    way: str = "repair"
+    reason: str = ""
     solid: Solid | None = field(default=None, repr=False)
-
-    def table(self) -> list[tuple[str, Any, Any]]:
-        """Rows (what, original, final)."""
-        return compared(self.before, self.after)
 
 
 def close_surface(
@@ -84,9 +66,7 @@ def close_surface(
     def by_repair() -> Closed:
         mended = repair(surface, max_move_mm=allowed, max_vanished=max_vanished, longest_hole_mm=longest_hole_mm)
         refused = (*mended.refused, short) if short else mended.refused
-        return Closed(
-            mended.surface, "repair", reason, mended.steps, refused, mended.moved_mm, mended.vanished, mended.before, mended.after
-        )
+        return Closed(**vars(mended) | {"refused": refused}, way="repair", reason=reason)
 
     if chosen == "relief":
         try:
@@ -125,4 +105,4 @@ def _as_relief(surface: Surface, back_mm: float, eye_mm: npt.ArrayLike | None, r
     steps = tuple(
         Step("close-relief", 1, note) for note in (*made.notes, f"skirt and back plane {back_mm:g} mm behind its deepest point")
     )
-    return Closed(made.surface, "relief", reason, steps, (), moved, vanished, before, made.verdict, made)
+    return Closed(made.surface, steps, (), moved, vanished, before, made.verdict, "relief", reason, made)

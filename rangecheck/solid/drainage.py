@@ -15,6 +15,7 @@ import numpy.typing as npt
 from rangecheck.arrays import BoolArray, FloatArray
 from rangecheck.kernels import kernel
 from rangecheck.solid.slices import cells_of
+from rangecheck.surface.edges import join_sets, root_of
 from rangecheck.surface.surface import Surface
 
 #: cells along the longest side, unless a step is given
@@ -61,27 +62,10 @@ def pockets(
 
 
 @kernel
-def _root(parent, i):
-    while parent[i] != i:
-        parent[i] = parent[parent[i]]
-        i = parent[i]
-    return i
-
-
-@kernel
-def _join(parent, i, j):
-    # 0 is the open: it is always the root of its group
-    i, j = _root(parent, i), _root(parent, j)
-    if i < j:
-        parent[j] = i
-    else:
-        parent[i] = j
-
-
-@kernel
 def retained(solid) -> BoolArray:
     """(layers, nx, ny) air cells that keep liquid; the first index is height. The grid's sides are open."""
     nz, nx, ny = solid.shape
+    # 0 is the open: as the lowest it is always the root of its set
     parent = np.arange(nx * ny * nz + 1)
     kept = np.zeros(solid.shape, np.bool_)
     for z in range(nz):
@@ -91,15 +75,15 @@ def retained(solid) -> BoolArray:
                     continue
                 here = (z * nx + x) * ny + y + 1
                 if x == 0 or y == 0 or z == 0 or x == nx - 1 or y == ny - 1 or z == nz - 1:
-                    _join(parent, here, 0)
+                    join_sets(parent, here, 0)
                 if x > 0 and not solid[z, x - 1, y]:
-                    _join(parent, here, here - ny)
+                    join_sets(parent, here, here - ny)
                 if y > 0 and not solid[z, x, y - 1]:
-                    _join(parent, here, here - 1)
+                    join_sets(parent, here, here - 1)
                 if z > 0 and not solid[z - 1, x, y]:
-                    _join(parent, here, here - nx * ny)
+                    join_sets(parent, here, here - nx * ny)
         for x in range(nx):
             for y in range(ny):
-                if not solid[z, x, y] and _root(parent, (z * nx + x) * ny + y + 1) != 0:
+                if not solid[z, x, y] and root_of(parent, (z * nx + x) * ny + y + 1) != 0:
                     kept[z, x, y] = True
     return kept

@@ -22,7 +22,8 @@ def run_watched(command: Sequence[str]) -> tuple[int, float]:
     peak = math.nan
     while process.poll() is None:
         held = held_mb(process.pid)
-        peak = held if not peak >= held else peak
+        if not math.isnan(held):  # it may have ended meanwhile
+            peak = held if math.isnan(peak) else max(peak, held)
         time.sleep(_PERIOD_S)
     return process.returncode, peak
 

@@ -132,7 +132,8 @@ def grouped_half_edges(faces, halves, low, high):
 
 
 @kernel
-def _root(parent, i):
+def root_of(parent, i):
+    """Root of the set that i belongs to, its lowest member; paths are halved on the way."""
     while parent[i] != i:
         parent[i] = parent[parent[i]]
         i = parent[i]
@@ -140,8 +141,9 @@ def _root(parent, i):
 
 
 @kernel
-def _join(parent, i, j):
-    i, j = _root(parent, i), _root(parent, j)
+def join_sets(parent, i, j):
+    """Makes one set of those of i and j."""
+    i, j = root_of(parent, i), root_of(parent, j)
     parent[max(i, j)] = min(i, j)
 
 
@@ -156,7 +158,7 @@ def _numbered(parent):
             number[i] = count
             count += 1
         else:
-            number[i] = number[_root(parent, i)]
+            number[i] = number[root_of(parent, i)]
     return count, number
 
 
@@ -174,8 +176,8 @@ def joined_corners(faces, halves, start):
             here, there = 3 * g + other, 3 * g + (other + 1) % 3
             if faces[g, other] != faces[f, side]:
                 here, there = there, here
-            _join(parent, 3 * f + side, here)
-            _join(parent, 3 * f + (side + 1) % 3, there)
+            join_sets(parent, 3 * f + side, here)
+            join_sets(parent, 3 * f + (side + 1) % 3, there)
     return _numbered(parent)
 
 
@@ -185,5 +187,5 @@ def joined_faces(face_count, halves, start):
     parent = np.arange(face_count).astype(np.int32)
     for edge in range(len(start) - 1):
         for i in range(start[edge] + 1, start[edge + 1]):
-            _join(parent, halves[start[edge]] // 3, halves[i] // 3)
+            join_sets(parent, halves[start[edge]] // 3, halves[i] // 3)
     return _numbered(parent)

@@ -22,6 +22,7 @@ from rangecheck.surface.surface import Surface
 FACES_PER_LEAF = 4
 #: levels split on one thread before subtrees are handed to several
 _SHARED_LEVELS = 3
+_CHUNK = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,14 +60,15 @@ def _build(surface: Surface) -> TriangleTree:
     depth = max(0, math.ceil(math.log2(n / FACES_PER_LEAF)))
     step = 2.0 ** (math.floor(math.log2(max(surface.extent_mm, 2.0**-126))) - 2)
     centre = np.round(surface.bounds_mm.mean(axis=0) / step) * step
-    corners = (surface.vertices - centre)[surface.faces].reshape(n, 9)
-    keys = corners[:, 0:3] + corners[:, 3:6] + corners[:, 6:9]
+    local = surface.vertices - centre
+    keys, corners = np.empty((n, 3)), np.empty((n, 9))
+    in_chunks(lambda first, last: sums_of_corners(local, surface.faces, first, last, keys), n, _CHUNK)
     order = np.arange(n, dtype=np.int32)
     shared = min(_SHARED_LEVELS, depth)
     arrange(keys, order, 0, 0, shared, depth)
     if depth > shared:
         in_chunks(lambda first, _: arrange(keys, order, shared, first, depth, depth), 1 << shared, 1)
-    corners = corners[order]
+    in_chunks(lambda first, last: gathered(local, surface.faces, order, first, last, corners), n, _CHUNK)
     boxes = np.empty(((2 << depth) - 1, 6))
     leaves = 1 << depth
     in_chunks(lambda first, last: leaf_boxes(corners, depth, first, last, boxes), leaves, 1 << 14)
@@ -76,6 +78,23 @@ def _build(surface: Surface) -> TriangleTree:
         np.minimum(below[:, 0, :3], below[:, 1, :3], out=here[:, :3])
         np.maximum(below[:, 0, 3:], below[:, 1, 3:], out=here[:, 3:])
     return TriangleTree(order, corners, boxes, depth, centre)
+
+
+@kernel
+def sums_of_corners(vertices, faces, first, last, keys):
+    """Three times the centroids of the faces first:last."""
+    for f in range(first, last):
+        for axis in range(3):
+            keys[f, axis] = vertices[faces[f, 0], axis] + vertices[faces[f, 1], axis] + vertices[faces[f, 2], axis]
+
+
+@kernel
+def gathered(vertices, faces, order, first, last, corners):
+    """Corners of the faces in the places first:last of the tree."""
+    for place in range(first, last):
+        for corner in range(3):
+            for axis in range(3):
+                corners[place, 3 * corner + axis] = vertices[faces[order[place], corner], axis]
 
 
 @kernel
