@@ -9,6 +9,12 @@ from .common import common, settings_from
 @click.argument("scans", nargs=-1, required=True, type=click.Path())
 @click.option("--method", type=click.Choice(["auto", "grid", "fuse", "poisson", "pivot"]), help="How scans become triangles.")
 @click.option("--height-mm", type=float, help="Scale the finished bust to this height.")
+@click.option("--each", is_flag=True, help="Each of SCANS is a subject of its own, with a folder of its own in DIR.")
+@click.option(
+    "--scheduler",
+    metavar="ADDRESS",
+    help="Make the frames, or with --each the subjects, on a dask cluster, for example tcp://10.0.0.1:8786.",
+)
 @click.option("--dry-run", is_flag=True, help="Check inputs, settings, encoder and room on the disk; compute nothing.")
 @common("out", "register", "filter", "refine", "unit", "size", "frames", "tolerance", "seed", "config", "set", "force")
 def command(
@@ -28,6 +34,8 @@ def command(
     assignments,
     force,
     dry_run,
+    each,
+    scheduler,
     reporter,
 ):
     """Do the whole job: mesh, check, close, render, measure, export STL, report.
@@ -35,7 +43,7 @@ def command(
     SCANS are files, a folder, a manifest, a .conf with poses, or a folder of structured-light pictures. DIR gets bust.stl (only of
     what is really solid), plaster.mp4, steel.mp4, maps, report.html and run.json. A run that was stopped goes on where it was.
     """
-    from rangecheck.pipeline import rehearse, run
+    from rangecheck.pipeline import rehearse, run, run_each
 
     settings = settings_from(
         config,
@@ -51,4 +59,9 @@ def command(
         picture__width=size and size[0],
         picture__height=size and size[1],
     )
-    return (rehearse if dry_run else run)(scans, out, settings=settings, unit=unit, force=force, reporter=reporter)
+    if dry_run:
+        if each:
+            raise click.UsageError("--dry-run looks at one subject; leave --each away")
+        return rehearse(scans, out, settings=settings, unit=unit, force=force, reporter=reporter)
+    work = run_each if each else run
+    return work(scans, out, settings=settings, unit=unit, force=force, reporter=reporter, scheduler=scheduler)

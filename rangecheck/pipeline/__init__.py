@@ -26,6 +26,7 @@ _WHERE = {
     "render": "pictures",
     "report": "page",
     "run": "job",
+    "run_each": "many",
     "sample": "scanning",
     "simulate": "scanning",
     "solid": "shape",
