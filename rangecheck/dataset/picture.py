@@ -17,6 +17,7 @@ from rangecheck import rigid
 from rangecheck.arrays import FloatArray
 from rangecheck.dataset.index import regions
 from rangecheck.dataset.ranges import Sample
+from rangecheck.export.map_files import arrays_of
 from rangecheck.export.pictures import exposure_from, png_bytes
 from rangecheck.maps import Maps, trace_chain, trace_maps, trace_shadows
 from rangecheck.maps.secondary import NormalsAt
@@ -143,13 +144,7 @@ def _truth(
     """NPZ of every map: distance_mm, depth_mm float64, normals, incidence_rad, part_id, face, secondary_id, shadows (k, h, w), radiance,
     coverage."""
     chain = trace_chain(scene.surface, maps, tracer.caster, normals=normals)
-    arrays = {
-        "distance_mm": maps.distance_mm,
-        "depth_mm": maps.depth_mm,
-        "normals": maps.normals,
-        "incidence_rad": maps.incidence_rad,
-        "part_id": maps.part_id,
-        "face": maps.face,
+    arrays = arrays_of(maps) | {
         "secondary_id": chain.secondary_id,
         "radiance": radiance,
         "coverage": coverage,

@@ -11,7 +11,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from rangecheck.arrays import FloatArray
+from rangecheck.arrays import FloatArray, IntArray
 from rangecheck.errors import InputError, RangecheckError
 from rangecheck.export.legend import NOTHING as NOTHING_COLOUR
 from rangecheck.export.legend import Swatches, framed
@@ -36,16 +36,14 @@ def describe(maps: Maps) -> dict[str, Any]:
     }
 
 
+def arrays_of(maps: Maps) -> dict[str, FloatArray | IntArray]:
+    """The maps by name: distance_mm, depth_mm (float64, NaN = nothing), normals, incidence_rad (float32), part_id (0 = none), face (-1 = none)."""
+    return {name: getattr(maps, name) for name in ("distance_mm", "depth_mm", "normals", "incidence_rad", "part_id", "face")}
+
+
 def write_maps_npz(path: str | Path, maps: Maps, *, force: bool = True) -> None:
-    """NPZ of distance_mm, depth_mm (float64, NaN = nothing), normals, incidence_rad (float32), part_id (0 = none), face (-1 = none),
-    world_from_camera, and `description`, a JSON text with camera and part names."""
-    arrays = {
-        "distance_mm": maps.distance_mm,
-        "depth_mm": maps.depth_mm,
-        "normals": maps.normals,
-        "incidence_rad": maps.incidence_rad,
-        "part_id": maps.part_id,
-        "face": maps.face,
+    """NPZ of `arrays_of`, world_from_camera, and `description`, a JSON text with camera and part names."""
+    arrays = arrays_of(maps) | {
         "world_from_camera": maps.world_from_camera,
         "description": np.array(json.dumps(describe(maps), sort_keys=True)),
     }
@@ -151,7 +149,10 @@ def write_value_map(
     where = Path(folder)
     paths = [where / f"{name}_16bit.png", where / f"{name}.png"]
     write_map_png16(paths[0], values, name, unit, force=force)
-    reach = float(np.nanmax(np.abs(values))) if signed and np.isfinite(values).any() else 1.0
-    ends = {"low": -reach, "high": reach, "colours": "RdBu_r"} if signed else {}
-    write_png(paths[1], coloured_map(values, title, unit, **ends), force=force)  # type: ignore[arg-type]
+    if signed:
+        reach = float(np.nanmax(np.abs(values))) if np.isfinite(values).any() else 1.0
+        picture = coloured_map(values, title, unit, low=-reach, high=reach, colours="RdBu_r")
+    else:
+        picture = coloured_map(values, title, unit)
+    write_png(paths[1], picture, force=force)
     return paths
