@@ -192,7 +192,7 @@ def _our_racers(scene: Scene, size: int, settings: Settings, half: int) -> tuple
     where = (films[0].coverage > 0) & (films[1].coverage > 0)
     even = Racer("rangecheck, evenly", evenly, (4, 16, 64, 128, 256), reference, ready, "samples a pixel")
     # of the whole frame's mean, which the dark around the object lowers
-    aims = (0.08, 0.04, 0.02, 0.014, 0.01, 0.007)
+    aims = (0.08, 0.04, 0.02, 0.014, 0.01, 0.007, 0.005)
     needed = Racer("rangecheck, where needed", where_needed, aims, reference, ready, "error aimed at")
     return [even, needed], where
 

@@ -40,6 +40,9 @@ _CACHE_SHARE = 0.8
 #: the estimate of the remaining noise is asked to stay this far below what is left
 _NOISE_SHARE = 0.95
 _PILOT_PIXELS, _PILOT_PASSES = 2048, 8
+#: light is kept on surfaces where following it takes so many times more rays; of the error over all of them the picture is taken to have
+#: this share at least
+_WORTH_KEEPING, _UNSEEN = 2.0, 0.2
 #: of a small picture the pilot sees one pixel in so many, but not fewer than these
 _ONE_IN, _FEWEST_PIXELS = 4, 320
 #: a form that may be off by more than this share of the peak is not tried
@@ -145,6 +148,8 @@ class _Planner:
         order = pixel_order(picture.camera.width, picture.camera.height)
         # blocks of 4 x 4 pixels, one from each of many equal stretches of the picture: spread over it, yet coherent
         enough = min(_PILOT_PIXELS, max(len(order) // _ONE_IN, _FEWEST_PIXELS))
+        if tracer.materials.shiny.any():  # highlights are small, and bright
+            enough = _PILOT_PIXELS
         blocks, wanted = max(1, len(order) // 16), min(len(order) // 16, enough // 16)
         places = (np.arange(wanted) + np.random.default_rng(seed).random(wanted)) / max(wanted, 1) * blocks
         chosen = order[: blocks * 16].reshape(blocks, 16)[places.astype(int)] if wanted else order
@@ -223,6 +228,11 @@ class _Planner:
             self.settings = replace(self.settings, shadow_rays=0)
             self.reasons.append("shadows: the scene has no sources")
             return
+        if self.tracer.materials.shiny.any():
+            self.reasons.append(
+                "soft shadows: kept; where surfaces shine, the whole of a source is mirrored, and as many rays aim at it"
+            )
+            return
         self._try("soft shadows", replace(self.settings, shadow_rays=0), "one shadow ray to each source's middle")
 
     def _reflections(self) -> None:
@@ -275,7 +285,7 @@ class _Planner:
         records = records_for(pixels)
         samples = self._samples_to_come()
         keeping, following = rays_to_keep(tracer, records), rays_of_paths(tracer, pixels, samples)
-        if following < keeping:
+        if following < _WORTH_KEEPING * keeping:
             self.reasons.append(
                 f"diffuse light: followed path by path, about {samples:.0f} samples a pixel and {following:.2g} rays; to keep it on the "
                 f"surfaces would take as long as {keeping:.2g}"
@@ -292,6 +302,9 @@ class _Planner:
             ("second", "where rays of the surface seen arrive", partial(off_at_second, tracer, kept, seen, looked_at, self.seed)),
         ):
             cost = self._relative(*off())
+            if way == "cache":
+                # some hundred places may miss the few where interpolation fails, which the error over all surfaces tells of
+                cost = max(cost, _UNSEEN * kept.error)
             tried.append(f"{words} {_percent(cost)} of the picture")
             if cost <= allowed and (way == "cache" or self.settings.depth > 1):
                 self.settings = replace(self.settings, gather_diffuse=way, records=records)

@@ -17,9 +17,9 @@ from rangecheck.transport.irradiance import RAYS, IrradianceCache
 from rangecheck.transport.tracer import Tracer
 
 #: places at which a pixel's own light is gathered afresh, and at which that of its surroundings is: so many, each by its rays
-_PLACES, _GROUPS, _EACH = 256, 48, 8
+_PLACES, _GROUPS, _EACH = 512, 48, 8
 #: records of a picture: as many as it has pixels, within these
-_FEWEST, _MOST = 1500, 6000
+_FEWEST, _MOST = 800, 6000
 #: rays for which the time of finding a node's records would do, and light on its way from the camera meets surfaces so often
 _NODE_RAYS, _MEETINGS = 6, 2.5
 
