@@ -11,10 +11,12 @@ from rangecheck import rigid
 from rangecheck.config import load_settings
 from rangecheck.errors import PosesRefused
 from rangecheck.pipeline.preparing import prepared
+from rangecheck.pipeline.together import sentence_of, verdicts_of
 from rangecheck.progress import Reporter
 from rangecheck.scan.point_cloud import PointCloud
 from rangecheck.scan.readers import write_scans
 from rangecheck.scan.registration import check_poses
+from rangecheck.solid.findings import Verdict, finding
 
 
 @pytest.fixture(scope="module")
@@ -90,3 +92,24 @@ def test_clouds_pass_as_they_are(views):
     cloud = PointCloud(views[0].points_mm())
     made, _ = ready([cloud], quality=True)
     assert made.scans == [cloud] and made.quality is None
+
+
+def test_one_sentence_says_all_verdicts_the_worst_first():
+    solid = Verdict((), {"volume_mm3": 1000.0})
+    scans = {
+        "verdict": "unfit",
+        "profile": {"name": "bust-150"},
+        "findings": [{"severity": "error", "text": "half was never seen"}],
+    }
+    likeness = {"fit": True, "verdict": "accurate enough for a bust: its noise is within"}
+    rows = verdicts_of(solid, scans, likeness)
+    assert [row["word"] for row in rows] == ["unfit", "accurate enough", "fit"]
+    assert sentence_of(rows).startswith("scans for bust-150: unfit; ") and "half was never seen" in sentence_of(rows)
+    assert [row["about"] for row in verdicts_of(solid, None, likeness)] == ["likeness where it was seen", "solid"]
+
+
+def test_a_solid_held_back_for_its_scans_is_still_called_a_solid():
+    held = Verdict((finding("too-much-invented", 3, "40 % was never measured"),), {"volume_mm3": 1000.0})
+    assert not held.fit and held.sentence() == "solid, but not fit: 40 % was never measured"
+    open_too = Verdict((*held.findings, finding("open-edges", 3, "it is open")), {})
+    assert open_too.sentence().startswith("not solid: ")

@@ -116,6 +116,13 @@ def test_a_scan_out_of_place_shows_in_its_overlap(views):
     assert [f.scan for f in quality.findings if f.code == "scan-overlap"] == ["view4"]
 
 
+def test_what_a_single_scan_cannot_see_is_a_reservation_and_not_a_fault(views):
+    alone = assess(views[:1], cells=CELLS)
+    unseen = next(f for f in alone.findings if f.code == "scan-unseen")
+    assert unseen.severity == "warning" and unseen.value > 0.2
+    assert next(f for f in assess(views[:2], cells=CELLS).findings if f.code == "scan-unseen").severity == "error"
+
+
 def test_the_profile_decides_the_verdict(views, poles):
     everything = [*views, *poles]
     easy = Profile(

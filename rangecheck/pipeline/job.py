@@ -33,6 +33,7 @@ from rangecheck.pipeline.preparing import Prepared, prepared
 from rangecheck.pipeline.scanning import refused
 from rangecheck.pipeline.shape import findings_lines, solid_of, standing_of
 from rangecheck.pipeline.subject import Subject, eye_of, hashes, read_all_scans, surface_of
+from rangecheck.pipeline.together import sentence_of, verdicts_of
 from rangecheck.pipeline.turning import Rendered, render_turntable
 from rangecheck.pipeline.views import map_at, orbit_of
 from rangecheck.progress import Reporter
@@ -66,7 +67,7 @@ def run(
         # the thread ends before the folder is given free, however the job ends
         with job_folder(out, key, FINISHED, force=force) as folder, _one_thread() as aside:
             outcome = _made(ready, folder, aside, settings, reporter, inputs=inputs, force=force, scheduler=scheduler)
-    done = f"{out}: {'fit' if outcome.fit else 'not fit'}; {time.perf_counter() - began:.1f} s"
+    done = f"{out}: {sentence_of(outcome.document['verdicts'])}; {time.perf_counter() - began:.1f} s"
     return replace(outcome, lines=[done, *outcome.lines])
 
 
@@ -127,7 +128,7 @@ def _made(
     ready = ready.whole()
     shares = {name: shown.share_of_area(origin) for origin, name in enumerate(ORIGIN_NAMES)}
     content = document(
-        "run", fit=judged.fit, verdict=judged.to_dict(), stl=stl, method=method, reason=reason, area_shares=shares,
+        "run", fit=judged.fit, verdicts=verdicts_of(judged, ready.quality, consistency), verdict=judged.to_dict(), stl=stl, method=method, reason=reason, area_shares=shares,
         scans=[scan_facts(scan) for scan in ready.scans], quality=ready.quality, registration=ready.registration, filtered=ready.filtered, refined=ready.refining,
         faces=len(shown.faces), decisions=reporter.notes, front_deg=front,
         consistency=consistency,
@@ -142,7 +143,7 @@ def _made(
     content["seconds"] = dict(reporter.seconds)
     write_json(folder / FINISHED, content)
     lines = [
-        *ready.quality_lines[:2],
+        *ready.quality_lines[1:2],
         *findings_lines(judged),
         f"bust.stl: {stl['faces']:,} faces, read back and checked" if stl else "no STL: the findings above hold it back",
         f"look at {folder / 'report.html'}",

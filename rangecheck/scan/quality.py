@@ -326,9 +326,11 @@ def _findings(views, wanted: Profile, scale, seen, unseen, spacing, error, step,
             found.append(Finding(code, "error" if far else "warning", text, value, limit, scan))
 
     largest = f", the largest around ({', '.join(f'{x:.0f}' for x in gaps[0].centre_mm)}) mm" if gaps else ""
-    add("scan-unseen", 1 - seen, wanted.most_unseen, 4 * wanted.most_unseen,
+    # what a single scan cannot see is no fault of it: never more than a warning
+    add("scan-unseen", 1 - seen, wanted.most_unseen, 4 * wanted.most_unseen if len(views) > 1 else 1.0,
         f"{100 * (1 - seen):.1f} % of the surface in reach ({unseen / 100:.0f} cm2) was never seen, in {len(gaps)} gaps{largest} "
-        f"(at most {100 * wanted.most_unseen:.0f} %); scan again from the next view")  # fmt: skip
+        f"(at most {100 * wanted.most_unseen:.0f} %); "
+        + ("one scan makes a relief, and a bust takes more" if len(views) == 1 else "scan again from the next view"))  # fmt: skip
     add("scan-spacing", scale * spacing, wanted.most_spacing_mm, 3 * wanted.most_spacing_mm,
         f"samples lie {scale * spacing:.2f} mm apart at the print (at most {wanted.most_spacing_mm:g} mm); scan from nearer, or print smaller")  # fmt: skip
     add("scan-error", scale * error, wanted.most_error_mm, 4 * wanted.most_error_mm,

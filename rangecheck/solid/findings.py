@@ -20,6 +20,8 @@ from rangecheck.files import presets_folder
 SEVERITIES = ("note", "warning", "error")
 #: places kept with a finding; its count is exact whatever their number
 PLACES_KEPT = 200
+#: findings about what a surface was made of: it may be a solid all the same
+ABOUT_SCANS = ("too-much-invented",)
 
 
 @dataclass(frozen=True)
@@ -148,10 +150,11 @@ class Verdict:
         raise KeyError(code)
 
     def sentence(self) -> str:
-        """One line: solid, or the errors in the order of their weight."""
+        """One line: solid, or the errors in the order of their weight; what is solid but held back for its scans' sake is said to be so."""
         if self.fit:
             return f"solid: closed, manifold, oriented, {self.facts['volume_mm3'] / 1000:.2f} cm3"
-        return "not solid: " + "; ".join(f.message for f in self.errors)
+        word = "solid, but not fit: " if all(f.code in ABOUT_SCANS for f in self.errors) else "not solid: "
+        return word + "; ".join(f.message for f in self.errors)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready."""
