@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, ClassVar
 
 import numpy as np
@@ -106,6 +106,9 @@ class PinholeCamera(Camera):
         directions = unit_vectors(np.stack([x, y, np.ones_like(x)], axis=-1))
         return np.zeros_like(directions), directions
 
+    def pixel_rays(self) -> tuple[FloatArray, FloatArray]:
+        return _distorted_rays(self) if any(self.distortion) else super().pixel_rays()
+
     def project(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
         z = points_mm[..., 2]
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -114,6 +117,15 @@ class PinholeCamera(Camera):
             x, y = distort(x, y, self.distortion)
         uv = np.stack([self.fx * x + self.cx, self.fy * y + self.cy], axis=-1)
         return uv, np.where(z > 0, np.linalg.norm(points_mm, axis=-1), np.nan)
+
+
+@lru_cache(maxsize=1)
+def _distorted_rays(camera: PinholeCamera) -> tuple[FloatArray, FloatArray]:
+    """A distorted camera's pixel rays, kept for the camera that was asked last: each takes Newton's method. Not to be written into."""
+    rays = Camera.pixel_rays(camera)
+    for array in rays:
+        array.setflags(write=False)
+    return rays
 
 
 @dataclass(frozen=True)

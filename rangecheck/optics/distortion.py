@@ -13,11 +13,12 @@ from functools import lru_cache
 import numpy as np
 
 from rangecheck.arrays import FloatArray
-from rangecheck.kernels import inline_kernel, kernel
+from rangecheck.kernels import in_chunks, inline_kernel, kernel
 
 #: Newton's step is below this, in normalised coordinates, when the inverse is found: 1e-6 px at a focal length of 1e6 px
 CONVERGED = 1e-13
 NEWTON_STEPS = 60
+_CHUNK = 65536
 
 
 def coefficients(distortion: tuple[float, ...]) -> FloatArray:
@@ -108,7 +109,10 @@ def undistort(xd: FloatArray, yd: FloatArray, distortion: tuple[float, ...]) -> 
     """Undistorted coordinates of distorted ones: Newton's method on the branch that holds the middle; NaN beyond the fold."""
     a, b = np.broadcast_arrays(np.asarray(xd, np.float64), np.asarray(yd, np.float64))
     x, y = np.empty(a.size), np.empty(a.size)
-    _undistort_all(a.ravel(), b.ravel(), coefficients(distortion), fold_radius(distortion), CONVERGED, NEWTON_STEPS, x, y)
+    flat, k, fold = (a.ravel(), b.ravel()), coefficients(distortion), fold_radius(distortion)
+    in_chunks(
+        lambda i, j: _undistort_all(flat[0][i:j], flat[1][i:j], k, fold, CONVERGED, NEWTON_STEPS, x[i:j], y[i:j]), a.size, _CHUNK
+    )
     return x.reshape(a.shape), y.reshape(a.shape)
 
 
