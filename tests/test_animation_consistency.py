@@ -6,11 +6,15 @@ from test_maps import ball
 
 from rangecheck import kernels, rigid
 from rangecheck.animation import faces_seen, measure_consistency, orbit_around, outline_of, verdict_for
+from rangecheck.animation.standing_out import departure_in, spots
 from rangecheck.errors import SurfaceError
 from rangecheck.maps import trace_maps
-from rangecheck.optics import PinholeCamera
+from rangecheck.optics import PinholeCamera, Sensor
+from rangecheck.reflectance import load_material
 from rangecheck.scan import RangeScan
+from rangecheck.scene import studio
 from rangecheck.surface import Surface
+from rangecheck.transport import Settings
 
 BALL = ball(50.0, subdivisions=5)
 
@@ -111,3 +115,22 @@ def test_the_verdict_depends_on_the_size_of_the_bust_and_on_the_printer():
     assert small.sentence.startswith("accurate enough for a bust of 100 mm") and "not accurate enough" in huge.sentence
     with pytest.raises(SurfaceError, match="layer_mm is 0"):
         verdict_for(found, 100, 100, 0, 0.05)
+
+
+def test_a_dent_stands_out_of_its_own_picture_and_a_sound_ball_shows_nothing():
+    radius, depth_mm = 20.0, 0.1
+    sound = ball(radius, subdivisions=6)
+    top = np.array([0.0, 0.0, radius])
+    away = np.linalg.norm(sound.vertices - top, axis=1)
+    sunk = Surface(sound.vertices * (1 - depth_mm / radius * np.exp(-0.5 * away**2))[:, None], sound.faces)
+    camera = PinholeCamera.from_field_of_view(120, 120, 6.0)
+    sensor, settings = (
+        Sensor(full_well=20_000.0, read_noise=10.0),
+        Settings(passes=1, each=4, depth=1, diffuse=False, backdrop=False),
+    )
+    found = []
+    for surface in (sound, sunk):
+        scene = studio(surface, load_material("steel"), "stripes", smooth=True).grey()
+        found.append(spots([departure_in(scene, camera, rigid.look_at((0, 0, 400), (0, 0, 0)), settings, sensor)], 5.0))
+    assert found[0] == []
+    assert len(found[1]) == 1 and np.linalg.norm(np.subtract(found[1][0].centre_mm, top)) < 3.0
