@@ -146,7 +146,7 @@ def _dent_part(quick: bool) -> Part:
         at, elsewhere = look.stands_out(WANTED_MM)
 
         def hidden(depth: float, look: _Looks = look) -> float:
-            return SIGMAS / max(look.stands_out(depth)[0], 1e-9)
+            return SIGMAS / max(look.stands_out(depth)[0], 1.0)
 
         shown = "steel in stripes" if light == "stripes" else "plaster"
         edge = find_edge(shown, hidden, DEEPEST_MM, LEAST_MM, 1.0, logarithmic=True, samples=samples, tolerance=0.2)
