@@ -7,14 +7,17 @@ import pytest
 from registration_cases import CAMERA, pebble, ring
 
 from rangecheck import rigid
+from rangecheck.animation import outline_of
 from rangecheck.errors import ScanError, SettingError
-from rangecheck.optics import OrthographicCamera
+from rangecheck.maps import trace_maps
+from rangecheck.optics import OrthographicCamera, PinholeCamera
 from rangecheck.scan import RangeScan
 from rangecheck.scan.quality import PROFILES, Profile, assess
 from rangecheck.scan.quality_space import Space as SeenSpace
 from rangecheck.scan.quality_space import directions, shell_of, views_from
 from rangecheck.scan.readers import read_scans
 from rangecheck.scan.simulate import RangeFinder, simulate_scan
+from rangecheck.surface import Surface
 
 CELLS = 40
 
@@ -167,3 +170,19 @@ def test_the_bunny_was_seen_but_for_its_base(real_data):
     assert quality.seen > 0.95 and quality.coverage > 0.98
     # its base is at 33 mm; bun_zipper has its holes there
     assert quality.gaps[0].centre_mm[1] < 45
+
+
+def test_a_stray_patch_that_the_surface_left_out_is_missing_but_no_part_of_the_outline():
+    ball = _ball()
+    camera, pose = PinholeCamera.from_field_of_view(160, 160, 40), rigid.look_at((0, 0, 240), (0, 0, 0))
+    distance = trace_maps(ball, camera, pose).distance_mm
+    distance[2:5, 2:6] = 300.0
+    found = outline_of(ball, RangeScan(distance.astype(np.float32), camera, pose))
+    assert found.worst_px == 0 and found.missing_share == pytest.approx(12 / np.isfinite(distance).sum())
+
+
+def _ball() -> Surface:
+    import trimesh
+
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=50.0)
+    return Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces).astype(np.int32))

@@ -271,7 +271,8 @@ class Outline:
     """Agreement of the surface's silhouette with a scan's valid cells, in that scan's own view.
 
     missing_share: valid cells where the surface is not seen; extra_share: cells the surface covers where nothing returned, outside
-    holes; both as shares of the valid cells. worst_px: how far the worst valid cell lies from the surface's picture."""
+    holes; both as shares of the valid cells. worst_px: how far the worst valid cell lies from the surface's picture, among patches of
+    valid cells of which the surface shows at least half: strays that meshing left out are missing, but no part of its outline."""
 
     missing_share: float
     extra_share: float
@@ -291,8 +292,19 @@ def outline_of(surface: Surface, scan: RangeScan, caster: Caster | None = None) 
     return Outline(
         missing_share=float((valid & ~hit).sum()) / count,
         extra_share=float((hit & outside).sum()) / count,
-        worst_px=float(away[valid].max(initial=0.0)) if hit.any() else math.inf,
+        worst_px=float(away[_shown_patches(valid, hit)].max(initial=0.0)) if hit.any() else math.inf,
     )
+
+
+def _shown_patches(valid: BoolArray, hit: BoolArray) -> BoolArray:
+    """Valid cells of those connected patches in which the surface shows at least half of the cells."""
+    import cv2
+
+    count, label = cv2.connectedComponents(valid.astype(np.uint8), connectivity=8)
+    cells = np.bincount(label[valid], minlength=count)
+    shown = np.bincount(label[valid & hit], minlength=count) >= 0.5 * np.maximum(cells, 1)
+    patches: BoolArray = valid & shown[label]
+    return patches
 
 
 def _reached_from_border(free: BoolArray) -> BoolArray:
