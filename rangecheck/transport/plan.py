@@ -301,10 +301,8 @@ class _Planner:
             ("cache", "at the surface seen", partial(off_at_once, kept, seen, looked_at)),
             ("second", "where rays of the surface seen arrive", partial(off_at_second, tracer, kept, seen, looked_at, self.seed)),
         ):
-            cost = self._relative(*off())
-            if way == "cache":
-                # some hundred places may miss the few where interpolation fails, which the error over all surfaces tells of
-                cost = max(cost, _UNSEEN * kept.error)
+            # some hundred places may miss the few where interpolation fails, which the error over all surfaces tells of
+            cost = max(self._relative(*off()), _UNSEEN * kept.error)
             tried.append(f"{words} {_percent(cost)} of the picture")
             if cost <= allowed and (way == "cache" or self.settings.depth > 1):
                 self.settings = replace(self.settings, gather_diffuse=way, records=records)
