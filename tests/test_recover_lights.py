@@ -11,6 +11,7 @@ from rangecheck.errors import SceneError
 from rangecheck.recover.sight import sphere_sight
 from rangecheck.recover.spheres import (
     Outline,
+    gains_under,
     light_from_chrome,
     lights_from_matt,
     outline_of,
@@ -80,6 +81,9 @@ def test_photographed_spheres_give_their_lamps_and_predict_each_other(real_data)
     # the list itself lies 2 degrees from the chrome sphere's lamps; the two spheres agree better with each other than with it
     assert np.median(degrees(matt.directions, chrome)) < 2.0
     assert np.median(degrees(matt.directions, listed)) < 3.0
+    # one albedo explains all twelve where the directions are the listed ones
+    gains = gains_under(pictures, outline, listed)
+    assert np.abs(gains / gains.mean() - 1.0).max() < 0.01
     assert math.sqrt(float((prediction_errors(pictures, outline, chrome) ** 2).mean())) < 0.04
 
 

@@ -188,3 +188,16 @@ def prediction_errors(
         found = least_squares(training, [0.5, 0.2], bounds=([0.0, 0.0], [10.0, 0.8]), loss="soft_l1", f_scale=_OUTLYING)
         errors.append(float(np.sqrt((away(found.x, k, np.arange(len(sight))) ** 2).mean())))
     return np.array(errors)
+
+
+def gains_under(pictures: Sequence[FloatArray], outline: Outline, lights: FloatArray, *, saturation: float = 1.0) -> FloatArray:
+    """(k,) albedo times irradiance / pi of a Lambertian sphere in each picture whose lamp's direction is known: least squares over lit pixels."""
+    shape = np.shape(pictures[0])
+    sight = sphere_sight(outline.centre_px, outline.radius_px, (shape[0], shape[1]))
+    gains = []
+    for picture, light in zip(pictures, lights, strict=True):
+        values = np.asarray(picture, np.float64).reshape(-1)[sight.pixel]
+        cosine = np.maximum(sight.normals @ light, 0.0)
+        used = (cosine > 0.0) & (values < saturation)
+        gains.append(float(values[used] @ cosine[used]) / float(cosine[used] @ cosine[used]))
+    return np.array(gains)
