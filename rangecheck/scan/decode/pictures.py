@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from rangecheck.arrays import BoolArray, FloatArray
 from rangecheck.errors import ScanError
+from rangecheck.kernels import in_chunks
 from rangecheck.scan.decode.code import coordinates
 
 Picture = npt.NDArray[Any]
@@ -93,8 +94,30 @@ class Seen:
     contrast: FloatArray
 
 
-def see(pictures: Pictures, min_contrast: float) -> Seen:
-    """Decode one camera. Raises ScanError when nothing is lit or nothing can be decoded."""
+def see_all(cameras: Sequence[Pictures], min_contrast: float) -> list[Seen]:
+    """Decode every camera, two codes at a time. Raises ScanError when nothing is lit or nothing can be decoded."""
+    lights = [_lit(pictures, min_contrast) for pictures in cameras]
+    codes = [(pictures, light, turned) for pictures, light in zip(cameras, lights) for turned in (False, True)]
+
+    def read(i: int, _: int) -> tuple[FloatArray, BoolArray] | None:
+        pictures, light, turned = codes[i]
+        pairs, phase = (pictures.row, pictures.row_phase) if turned else (pictures.column, pictures.column_phase)
+        return _axis(pictures, pairs, phase, *light, turned=turned) if pairs else None
+
+    found = in_chunks(read, len(codes), 1)
+    seen = []
+    for pictures, (_, _, contrast, lit), column, row in zip(cameras, lights, found[::2], found[1::2]):
+        if column is None or not np.isfinite(column[0]).any() or (row is not None and not np.isfinite(row[0]).any()):
+            raise ScanError(
+                f"{pictures.name}: pixels are lit but no code can be read; check the order of the pictures and their bits"
+            )
+        faint = column[1] if row is None else column[1] | row[1]
+        seen.append(Seen(column[0], None if row is None else row[0], lit, faint & lit, contrast))
+    return seen
+
+
+def _lit(pictures: Pictures, min_contrast: float) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+    """White and black, quieted, the contrast between them in 0..1, and where it is enough."""
     white, black = (_quiet(p) for p in (pictures.white, pictures.black))
     contrast = (white - black) / np.float32(pictures.full_scale)
     lit = contrast > min_contrast
@@ -102,16 +125,7 @@ def see(pictures: Pictures, min_contrast: float) -> Seen:
         raise ScanError(
             f"{pictures.name}: no pixel is {min_contrast:g} of full scale brighter in white than in black; check their order"
         )
-    column, faint = _axis(pictures, pictures.column, pictures.column_phase, white, black, contrast, lit, turned=False)
-    row = None
-    if pictures.row:
-        row, faint_row = _axis(pictures, pictures.row, pictures.row_phase, white, black, contrast, lit, turned=True)
-        faint |= faint_row
-    if not np.isfinite(column).any() or (row is not None and not np.isfinite(row).any()):
-        raise ScanError(
-            f"{pictures.name}: pixels are lit but no code can be read; check the order of the pictures and their bits"
-        )
-    return Seen(column, row, lit, faint & lit, contrast)
+    return white, black, contrast, lit
 
 
 def _axis(
@@ -126,13 +140,20 @@ def _axis(
     turned: bool,
 ) -> tuple[FloatArray, BoolArray]:
     """Coordinate (h, w) and where its finest stripes are too faint to see."""
+    import cv2
+
     n, missing = len(pairs), 0
     scale = np.float32(pictures.full_scale)
-    turn = (lambda a: np.ascontiguousarray(a.T)) if turned else np.ascontiguousarray
+
+    def turn(a: Any) -> Any:
+        if not turned:
+            return np.ascontiguousarray(a)
+        return cv2.transpose(a.view(np.uint8)).view(bool) if a.dtype == bool else cv2.transpose(a)
+
     differences = np.zeros((n, *(lit.T.shape if turned else lit.shape)), np.float32)
     for k, (pattern, inverse) in enumerate(pairs):
         if pattern is not None and inverse is not None:
-            difference = _quiet(pattern) - _quiet(inverse)
+            difference = _quiet(cv2.subtract(pattern, inverse, dtype=cv2.CV_32F))
         elif pattern is not None:
             difference = 2 * _quiet(pattern) - white - black
         elif inverse is not None:
@@ -140,7 +161,8 @@ def _axis(
         else:
             missing |= 1 << (n - 1 - k)
             continue
-        differences[k] = turn(difference / scale)
+        difference /= scale
+        differences[k] = turn(difference)
     lit, contrast = turn(lit), turn(contrast)
     some, some_lit, some_contrast = (np.ascontiguousarray(a[..., ::_LINES, :]) for a in (differences, lit, contrast))
     balance = np.zeros(n)
@@ -155,8 +177,6 @@ def _axis(
             differences[k] += np.float32(offset) * contrast
     coordinate, _ = coordinates(differences, lit, missing)
     finest = next(k for k in range(n - 1, -1, -1) if not (missing >> (n - 1 - k)) & 1)
-    import cv2
-
     swing = cv2.GaussianBlur(np.abs(differences[finest]), (0, 0), 3.0)
     faint = swing < 0.06 * np.maximum(contrast, 1e-3)
     if phase is not None:
@@ -167,7 +187,7 @@ def _axis(
 def _quiet(picture: Picture) -> FloatArray:
     import cv2
 
-    return cv2.GaussianBlur(picture.astype(np.float32), (0, 0), QUIET_PX)
+    return cv2.GaussianBlur(picture.astype(np.float32, copy=False), (0, 0), QUIET_PX)
 
 
 def _refined(coarse: FloatArray, steps: list[FloatArray], period: float) -> FloatArray:

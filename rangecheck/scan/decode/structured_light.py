@@ -23,7 +23,7 @@ from rangecheck.arrays import BoolArray, FloatArray, IntArray
 from rangecheck.errors import ScanError
 from rangecheck.optics import Camera
 from rangecheck.scan.decode.match import partners, smoothed
-from rangecheck.scan.decode.pictures import Pictures, Seen, see
+from rangecheck.scan.decode.pictures import Pictures, Seen, see_all
 from rangecheck.scan.range_scan import RangeScan
 
 MIN_CONTRAST = 0.03
@@ -105,7 +105,9 @@ def decode_gray_code(
         raise ScanError("structured light needs a second eye: pictures and view of a second camera, or the view of the projector")
     height, width = left.white.shape
     _fits(left, left_view)
-    seen = see(left, min_contrast)
+    if right is not None and right_view is not None:
+        _fits(right, right_view)
+    seen, *others = see_all([p for p in (left, right) if p is not None], min_contrast)
     lost = left.lost()
     if seen.row is None and right is not None:
         raise ScanError(f"{left.name}: two cameras need row and column codes to know what both see; only columns are there")
@@ -114,9 +116,8 @@ def decode_gray_code(
     known = np.isfinite(first.value[..., 0])
     reason[known] = Reason.UNSEEN
     if right is not None and right_view is not None:
-        _fits(right, right_view)
         lost += right.lost()
-        other = see(right, min_contrast)
+        other = others[0]
         if other.row is None:
             raise ScanError(f"{right.name}: two cameras need row and column codes to know what both see; only columns are there")
         place, unseen = partners(first, smoothed(other.column, other.row))
@@ -219,13 +220,13 @@ def _triangulated(first: View, second: View, uv: FloatArray, place: FloatArray, 
 def _noise_mm(ask: BoolArray, across_px: FloatArray, mm_per_px: FloatArray) -> float | None:
     """Standard deviation of range: what the residual across the epipolar line, less its mean over some cells around (which is the
     calibration's), scatters by; places scatter along the line as much, and that is range. None with too few pixels to tell."""
-    from scipy.ndimage import gaussian_filter
+    import cv2
 
     known = np.zeros(ask.shape, np.float32)
     signed = np.zeros(ask.shape, np.float32)
     known[ask], signed[ask] = np.isfinite(across_px), np.nan_to_num(across_px)
-    weight = gaussian_filter(known, _CALIBRATION_PX)
-    fluctuation = signed - gaussian_filter(signed, _CALIBRATION_PX) / np.maximum(weight, 1e-6)
+    weight, mean = (cv2.GaussianBlur(a, (0, 0), _CALIBRATION_PX, borderType=cv2.BORDER_REFLECT) for a in (known, signed))
+    fluctuation = signed - mean / np.maximum(weight, 1e-6)
     inside = (known > 0) & (weight > 0.5)
     if inside.sum() < 1000:
         return None
