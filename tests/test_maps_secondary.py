@@ -10,7 +10,15 @@ from rangecheck.analytic.reflections import box_corner_chain
 from rangecheck.errors import ArrayError
 from rangecheck.export.map_files import write_chain, write_shadows, write_value_map
 from rangecheck.export.pictures import read_map_png16, read_png
-from rangecheck.maps import back_projection_error, smooth_normals, trace_chain, trace_maps, trace_shadows, values_seen
+from rangecheck.maps import (
+    back_projection_error,
+    deviation_seen,
+    smooth_normals,
+    trace_chain,
+    trace_maps,
+    trace_shadows,
+    values_seen,
+)
 from rangecheck.maps.shadow import LIT, NOTHING, SHADED, TURNED_AWAY
 from rangecheck.optics import PinholeCamera
 from rangecheck.raycast import EmbreeCaster
@@ -163,6 +171,41 @@ def test_values_on_vertices_are_interpolated_and_values_on_faces_are_kept():
     assert np.isnan(seen[~maps.hit]).all()
     faces = values_seen(surface, maps, np.arange(6.0))
     assert (faces[maps.hit] == maps.face[maps.hit]).all()
+
+
+def test_deviation_from_a_displaced_sphere_is_the_distance_to_its_centre_less_its_radius():
+    import trimesh
+
+    radius, shift = 40.0, np.array([0.6, -0.3, 0.8])
+    sphere = trimesh.creation.icosphere(subdivisions=5, radius=radius)
+    here, there = Surface(sphere.vertices, sphere.faces), Surface(sphere.vertices + shift, sphere.faces)
+    maps = trace_maps(here, PinholeCamera.from_field_of_view(81, 61, 25), rigid.look_at((60, 90, 220), (0, 0, 0)))
+    seen = deviation_seen(maps, there)
+    truth = np.linalg.norm(maps.points_mm()[maps.hit] - shift, axis=1) - radius
+    # the other sphere's facets sag inside it: the distance is larger by up to that
+    sag = radius - np.linalg.norm(here.triangles.mean(axis=1), axis=1).min()
+    over = seen.distance_mm[maps.hit] - truth
+    assert seen.faced == seen.seen == maps.hit.sum()
+    assert over.min() > -1e-9 * radius and over.max() < 1.001 * sag < 0.02 * np.linalg.norm(shift)
+    # towards the shift the shifted one lies outside, away from it inside
+    assert seen.statistics()["lowest_mm"] < -0.9 and seen.statistics()["highest_mm"] > 0.5
+
+
+def test_what_an_open_surface_does_not_face_has_no_deviation():
+    floor, patch = (rectangle((-w, y, -w), (0, 0, 2 * w), (2 * w, 0, 0), "plate") for w, y in ((50, 0.0), (20, -0.5)))
+    maps = trace_maps(
+        floor,
+        PinholeCamera.from_field_of_view(41, 41, 20),
+        rigid.look_at((0, 300, 1), (0, 0, 0), up=(0, 0, -1)),
+        allow_inside=True,
+    )
+    seen = deviation_seen(maps, patch)
+    x, _, z = np.moveaxis(maps.points_mm(), -1, 0)
+    faced = np.maximum(np.abs(x), np.abs(z)) < 20
+    np.testing.assert_allclose(seen.distance_mm[faced], 0.5, atol=1e-4)
+    assert np.isnan(seen.distance_mm[~faced]).all() and 0 < seen.faced == faced.sum() < seen.seen
+    nothing = deviation_seen(maps, Surface(patch.vertices + (500, 0, 0), patch.faces))
+    assert nothing.faced == 0 and np.isnan(nothing.statistics()["rms_mm"])
 
 
 def test_chains_shadows_and_values_become_files(tmp_path):

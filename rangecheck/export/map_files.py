@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Sequence
+import zlib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -14,8 +15,8 @@ import numpy as np
 from rangecheck.arrays import FloatArray, IntArray
 from rangecheck.errors import InputError, RangecheckError
 from rangecheck.export.legend import NOTHING as NOTHING_COLOUR
-from rangecheck.export.legend import Swatches, framed
-from rangecheck.export.mapped import coloured_ids, coloured_map, contour_picture
+from rangecheck.export.legend import Swatches, framed, span_text
+from rangecheck.export.mapped import coloured_ids, coloured_map, contour_picture, range_of
 from rangecheck.export.pictures import write_id_png16, write_map_png16, write_png
 from rangecheck.files import read_bytes, whole_file, write_json
 from rangecheck.maps import Chain, Maps, Shadows
@@ -23,6 +24,12 @@ from rangecheck.maps.shadow import LIT, NOTHING, SHADED, STATE_NAMES, TURNED_AWA
 from rangecheck.optics import PinholeCamera, camera_from_dict
 
 SCHEMA = "rangecheck/maps/1"
+#: what NumPy and zipfile raise for damaged archives, and for headers that lie
+_DAMAGED = (
+    OSError, EOFError, BadZipFile, zlib.error, RuntimeError, ValueError, KeyError, TypeError, OverflowError, MemoryError, RangecheckError,
+)  # fmt: skip
+#: share of the pixels whose signed values the colours reach; a few far ones would leave the others white
+SHOWN = 0.99
 
 
 def describe(maps: Maps) -> dict[str, Any]:
@@ -41,12 +48,16 @@ def arrays_of(maps: Maps) -> dict[str, FloatArray | IntArray]:
     return {name: getattr(maps, name) for name in ("distance_mm", "depth_mm", "normals", "incidence_rad", "part_id", "face")}
 
 
-def write_maps_npz(path: str | Path, maps: Maps, *, force: bool = True) -> None:
-    """NPZ of `arrays_of`, world_from_camera, and `description`, a JSON text with camera and part names."""
-    arrays = arrays_of(maps) | {
-        "world_from_camera": maps.world_from_camera,
-        "description": np.array(json.dumps(describe(maps), sort_keys=True)),
-    }
+def write_maps_npz(path: str | Path, maps: Maps, more: Mapping[str, FloatArray] | None = None, *, force: bool = True) -> None:
+    """NPZ of `arrays_of`, `more` maps by name, world_from_camera, and `description`, a JSON text with camera and part names."""
+    arrays = (
+        arrays_of(maps)
+        | dict(more or {})
+        | {
+            "world_from_camera": maps.world_from_camera,
+            "description": np.array(json.dumps(describe(maps), sort_keys=True)),
+        }
+    )
     with whole_file(path, force=force) as part, part.open("wb") as stream:
         np.savez_compressed(stream, allow_pickle=False, **arrays)
 
@@ -65,13 +76,21 @@ def read_maps_npz(path: str | Path) -> Maps:
                     for name in ("world_from_camera", "distance_mm", "depth_mm", "normals", "incidence_rad", "part_id", "face")
                 },
             )
-    except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile, RangecheckError) as error:
+    except _DAMAGED as error:
         raise InputError(path, f"does not hold maps ({error}); it must be an NPZ that `rangecheck maps` wrote") from None
 
 
-def write_maps(folder: str | Path, maps: Maps, *, stem: str = "", subtitle: str = "", force: bool = True) -> list[Path]:
-    """All files of one set of maps in `folder`, their names led by `stem`: maps.npz, distance, depth, incidence and part_id as
-    *_16bit.png and coloured .png, and contours.png. Returns the paths."""
+def write_maps(
+    folder: str | Path,
+    maps: Maps,
+    *,
+    stem: str = "",
+    subtitle: str = "",
+    more: Mapping[str, FloatArray] | None = None,
+    force: bool = True,
+) -> list[Path]:
+    """All files of one set of maps in `folder`, their names led by `stem`: maps.npz (with `more` maps), distance, depth, incidence
+    and part_id as *_16bit.png and coloured .png, and contours.png. Returns the paths."""
     where = Path(folder)
     written: list[Path] = []
 
@@ -79,7 +98,7 @@ def write_maps(folder: str | Path, maps: Maps, *, stem: str = "", subtitle: str 
         written.append(where / f"{stem}{name}")
         return written[-1]
 
-    write_maps_npz(named("maps.npz"), maps, force=force)
+    write_maps_npz(named("maps.npz"), maps, more, force=force)
     floats = (
         ("distance", maps.distance_mm, "mm", "Distance from the focal point", "viridis"),
         ("depth", maps.depth_mm, "mm", "Depth along the optical axis", "viridis"),
@@ -145,13 +164,18 @@ def write_value_map(
     folder: str | Path, name: str, values: FloatArray, title: str, unit: str, *, signed: bool = False, force: bool = True
 ) -> list[Path]:
     """A map of a value carried by the surface (see `maps.values_seen`) as `name`_16bit.png and a coloured picture; a signed one
-    is drawn about 0, blue below and red above. Returns the paths."""
+    is drawn about 0, blue below and red above, up to the size that SHOWN of the pixels keep. Returns the paths."""
     where = Path(folder)
     paths = [where / f"{name}_16bit.png", where / f"{name}.png"]
     write_map_png16(paths[0], values, name, unit, force=force)
     if signed:
-        reach = float(np.nanmax(np.abs(values))) if np.isfinite(values).any() else 1.0
-        picture = coloured_map(values, title, unit, low=-reach, high=reach, colours="RdBu_r")
+        size = np.abs(values[np.isfinite(values)])
+        reach = float(np.quantile(size, SHOWN)) if len(size) else 0.0
+        reach = reach or float(size.max(initial=0.0)) or 1.0
+        subtitle = ""
+        if size.max(initial=0.0) > reach:
+            subtitle = f"{span_text(*range_of(values))} {unit}; the colours end where {SHOWN:.0%} of the pixels do"
+        picture = coloured_map(values, title, unit, subtitle=subtitle, low=-reach, high=reach, colours="RdBu_r")
     else:
         picture = coloured_map(values, title, unit)
     write_png(paths[1], picture, force=force)

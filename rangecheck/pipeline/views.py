@@ -11,8 +11,17 @@ from rangecheck.arrays import FloatArray
 from rangecheck.config import Settings
 from rangecheck.errors import InputError, OutputError
 from rangecheck.export.camera_files import write_camera_json
-from rangecheck.export.map_files import write_chain, write_maps, write_shadows
-from rangecheck.maps import Maps, back_projection_error, require_outside, trace_chain, trace_maps, trace_shadows
+from rangecheck.export.map_files import write_chain, write_maps, write_shadows, write_value_map
+from rangecheck.maps import (
+    Maps,
+    SeenDeviation,
+    back_projection_error,
+    deviation_seen,
+    require_outside,
+    trace_chain,
+    trace_maps,
+    trace_shadows,
+)
 from rangecheck.optics import PinholeCamera
 from rangecheck.pipeline.camera import camera_of
 from rangecheck.pipeline.folder import check_free, check_writable
@@ -83,13 +92,16 @@ def maps(
     unit: str | None,
     camera_mm: tuple[float, ...] | None,
     bounces: int = 1,
+    against: str | None = None,
     force: bool,
     reporter: Reporter,
 ) -> Outcome:
     """All maps of what is in `path` from one focal point, proved by projecting them back onto the surface; for a modelled scene
-    also the chain of surfaces that its mirror rays meet, and its sources' shadows."""
+    also the chain of surfaces that its mirror rays meet, and its sources' shadows; and how far what is seen lies from what is in
+    `against`, a mesh, scans or a scene in the same frame."""
     check_free(out, "maps.npz", force=force)
     subject = read_subject(path, settings, unit, reporter)
+    other = None if against is None else read_subject(against, settings, unit, reporter)
     camera, pose = view_of(subject, settings, camera_mm)
     surface, model = subject.surface, subject.model
     normals = None if model is None else model.normals_at
@@ -98,9 +110,15 @@ def maps(
         measured = trace_maps(surface, camera, pose, caster)
         chain = trace_chain(surface, measured, caster, bounces=bounces, normals=normals)
         proof = back_projection_error(surface, measured)
+        apart = None if other is None else deviation_seen(measured, other.surface)
     with reporter.stage("writing"):
         eye = ", ".join(f"{x:.0f}" for x in pose[:3, 3])
-        written = write_maps(out, measured, subtitle=f"focal point at ({eye}) mm")
+        more = {} if apart is None else {"deviation_mm": apart.distance_mm}
+        written = write_maps(out, measured, subtitle=f"focal point at ({eye}) mm", more=more)
+        if apart is not None and other is not None:
+            written += write_value_map(
+                out, "deviation", apart.distance_mm, f"Deviation from {other.name}, positive outside", "mm", signed=True
+            )
         written += write_chain(out, measured, chain)
         if model is not None and model.lamps:
             lamps = np.array([(*lamp.centre_mm, 1.0) for lamp in model.lamps])
@@ -112,6 +130,8 @@ def maps(
         f"{out}: {len(written) + 1} files; distances {nearest:.2f} to {farthest:.2f} mm over {int(measured.hit.sum()):,} pixels",
         f"projected back, no point lies further than {proof.distance_max_mm:.2g} mm from the surface (bound {proof.bound_mm:.2g} mm)",
     ]
+    if apart is not None and other is not None:
+        lines += _apart(apart, other.name)
     if model is not None:
         lines += [
             f"  {seen} mirrors {met}: {pixels:,} pixels" for seen, met, pixels in chain.pairs(measured) if met != "nothing"
@@ -130,6 +150,9 @@ def maps(
                 "bound_mm": proof.bound_mm,
                 "holds": proof.holds,
             },
+            deviation=None
+            if apart is None or other is None
+            else {"from": other.name, "pixels": apart.faced, **apart.statistics()},
             camera=camera.to_dict(),
             world_from_camera=pose,
             seconds=reporter.seconds,
@@ -137,6 +160,20 @@ def maps(
         lines,
         proof.holds,
     )
+
+
+def _apart(found: SeenDeviation, name: str) -> list[str]:
+    """What the deviation map says, in lines."""
+    if not found.faced:
+        return [f"nothing of {name} faces what is seen; both must be in one frame and unit"]
+    said = found.statistics()
+    lines = [
+        f"from {name}: {said['mean_mm']:+.3g} mm on average, RMS {said['rms_mm']:.3g}, 95 % within {said['p95_mm']:.3g}, "
+        f"from {said['lowest_mm']:+.3g} to {said['highest_mm']:+.3g} mm (positive: outside it)"
+    ]
+    if found.faced < found.seen:
+        lines.append(f"nothing of {name} faces {1 - found.faced / found.seen:.1%} of what is seen: left out")
+    return lines
 
 
 def draw(

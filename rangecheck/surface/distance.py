@@ -78,10 +78,15 @@ class SurfaceDistance:
 
     def signed_distance_mm(self, points_mm: FloatArray) -> tuple[FloatArray, IntArray]:
         """As `distance_mm`, negative on the inner side. On an open surface the sign means "behind the nearest face"."""
+        signed, found = self.signed_nearest(points_mm)
+        return signed, found.face
+
+    def signed_nearest(self, points_mm: FloatArray) -> tuple[FloatArray, Nearest]:
+        """As `signed_distance_mm`, with the nearest points."""
         found = self.nearest(points_mm)
         away = np.asarray(points_mm, dtype=np.float64) - found.place_mm
         side = np.einsum("ij,ij->i", away, self._pseudonormals(found))
-        return np.where(side < 0, -found.distance_mm, found.distance_mm), found.face
+        return np.where(side < 0, -found.distance_mm, found.distance_mm), found
 
     def _pseudonormals(self, found: Nearest) -> FloatArray:
         normals = self._face_normals[found.face]
