@@ -32,6 +32,7 @@ COMMANDS = {
     "materials": "List materials, plot their lobes, print their energy table.",
     "explain": "Say what a finding means, why it matters and what mends it.",
     "init": "Write a settings file with every setting, its default, range and meaning.",
+    "schema": "Print the JSON Schema of a document, or of the settings.",
     "completion": "Print the script that lets a shell complete commands and options.",
     "report": "Make the report of a finished job again, with the charts of studies.",
     "doctor": "Say what is installed, what is missing, and the line that mends it.",

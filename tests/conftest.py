@@ -34,6 +34,30 @@ def sample_data() -> Path:
     return ROOT / "sample_data"
 
 
+@pytest.fixture(scope="session", autouse=True)
+def documents_keep_their_schemas():
+    """Every JSON document that any test has made, for a program or for the disk, is as its published schema says."""
+    import schemas_kept
+
+    from rangecheck import files
+    from rangecheck.pipeline.outcome import Outcome
+
+    made, written = Outcome.__init__, files.write_bytes
+
+    def outcome(self, document, *more, **others):
+        schemas_kept.require(document)
+        made(self, document, *more, **others)
+
+    def write_bytes(path, content, **others):
+        schemas_kept.require_text(path, content)
+        written(path, content, **others)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Outcome, "__init__", outcome)
+        patch.setattr(files, "write_bytes", write_bytes)  # as write_json calls it
+        yield
+
+
 _real_data_passed = 0
 
 

@@ -16,7 +16,7 @@ from rangecheck.optics import PinholeCamera
 FROZEN = {
     "RangeScan": "range_mm camera world_from_scan brightness name unit noise_mm",
     "Solid": "surface verdict notes _proof",
-    "Surface": "vertices faces part_of_face origin_of_face part_names vertex_error_mm",
+    "Surface": "vertices faces part_of_face origin_of_face part_names vertex_error_mm refined_of_face",
     "check_solid": None,
     "load_material": "name_or_path",
     "mesh_scans": None,

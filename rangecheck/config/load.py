@@ -1,4 +1,4 @@
-"""Settings from, in rising order of precedence: the schema's defaults, a preset or file, key=value pairs, single options."""
+"""Settings from, in rising order of precedence: the schema's defaults, a preset, a file, key=value pairs, single options."""
 
 from __future__ import annotations
 
@@ -16,16 +16,20 @@ from rangecheck.files import presets_folder, read_bytes
 
 
 def load_settings(
-    file: str | Path | None = None, assignments: Iterable[str] = (), overrides: Mapping[str, Any] | None = None
+    file: str | Path | None = None,
+    assignments: Iterable[str] = (),
+    overrides: Mapping[str, Any] | None = None,
+    preset: str | None = None,
 ) -> Settings:
     """Resolved settings.
 
     file         a TOML file, or the name of a preset in configs/jobs/ (quick, normal, fine)
     assignments  "section.key=value" with TOML values; a bare word is a string
     overrides    {"section.key": value}; None values are skipped
+    preset       the name of a preset, over which the file's settings go
 
     Raises InputError (file) or SettingError (key, with the nearest known name)."""
-    tree: dict[str, Any] = _read(file) if file else {}
+    tree: dict[str, Any] = _merged(_read(preset) if preset else {}, _read(file) if file else {})
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
         if not equals:
@@ -40,6 +44,14 @@ def load_settings(
         raise _explained(error, file) from None
 
 
+def _merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    """Both trees; where they meet, what is above."""
+    return below | {
+        key: _merged(below[key], value) if isinstance(value, dict) and isinstance(below.get(key), dict) else value
+        for key, value in above.items()
+    }
+
+
 def _read(file: str | Path) -> dict[str, Any]:
     path = Path(file)
     if path.suffix != ".toml" and not path.exists():
@@ -50,14 +62,14 @@ def _read(file: str | Path) -> dict[str, Any]:
         path = preset
     try:
         return tomllib.loads(read_bytes(path).decode())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(path, f"is not valid TOML ({error}); correct it and try again") from None
 
 
 def _value(text: str) -> Any:
     try:
         return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (tomllib.TOMLDecodeError, RecursionError):
         return text
 
 
@@ -82,6 +94,7 @@ def _explained(error: ValidationError, file: str | Path | None) -> SettingError:
         message = f"setting {key} is unknown; {hint}"
     else:
         message = f"setting {key} is {first['input']!r}: {first['msg'][0].lower()}{first['msg'][1:]}"
+    message = " ".join(message.split())
     return SettingError(f"{file}: {message}" if file else message, key=key)
 
 

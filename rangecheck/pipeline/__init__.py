@@ -28,6 +28,7 @@ _WHERE = {
     "run": "job",
     "run_each": "many",
     "sample": "scanning",
+    "schema": "beginning",
     "simulate": "scanning",
     "solid": "shape",
     "study": "inspect",

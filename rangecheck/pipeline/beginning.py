@@ -1,7 +1,8 @@
-"""Before the work: a commented settings file to start from, and a rehearsal of a job that computes nothing."""
+"""Before the work: a commented settings file to start from, the shapes of all documents, and a rehearsal of a job that computes nothing."""
 
 from __future__ import annotations
 
+import difflib
 import json
 import shutil
 from collections.abc import Iterator, Sequence
@@ -13,13 +14,15 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from rangecheck.config import Settings
-from rangecheck.errors import OutputError
+from rangecheck.errors import OutputError, SettingError
 from rangecheck.export.video import find_encoder
-from rangecheck.files import write_bytes
+from rangecheck.files import write_bytes, write_json
+from rangecheck.pipeline.documents import CONFIGURATION, schemas
 from rangecheck.pipeline.folder import check_free
 from rangecheck.pipeline.job import FINISHED
 from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.subject import read_all_scans
+from rangecheck.pipeline.views import refuse_existing
 from rangecheck.progress import Reporter
 from rangecheck.reflectance import load_material
 from rangecheck.scan.point_cloud import PointCloud
@@ -33,15 +36,45 @@ BYTES_BESIDES = 20_000_000
 
 
 def init(out: str, *, force: bool) -> Outcome:
-    """Write every setting with its default, range and meaning to `out`, each line a comment until it is changed."""
-    if Path(out).suffix.lower() != ".toml":
+    """Write every setting with its default, range and meaning to `out`, each line a comment until it is changed, and beside it the JSON
+    Schema by which editors complete and check it."""
+    path = Path(out)
+    if path.suffix.lower() != ".toml":
         raise OutputError(out, "must end in .toml")
-    lines = ["# Settings of rangecheck. Take the # away from a line to change it; what stays a comment keeps its default.", ""]
+    described = path.with_suffix(".schema.json")
+    for target in (path, described):
+        refuse_existing(target, force)
+    # the first line is how Taplo, and with it most editors, find the schema of a TOML file
+    lines = [
+        f"#:schema ./{described.name}",
+        "# Settings of rangecheck. Take the # away from a line to change it; what stays a comment keeps its default.",
+        "",
+    ]
     lines += _section(Settings, "")
-    write_bytes(out, ("\n".join(lines) + "\n").encode(), force=force)
+    write_json(described, schemas()[CONFIGURATION], force=force)
+    write_bytes(path, ("\n".join(lines) + "\n").encode(), force=force)
     return Outcome(
-        document("init", output=out), [f"{out}: every setting with its default", f"use it with: rangecheck run SCANS --config {out} --out DIR"]
-    )  # fmt: skip
+        document("init", output=out, json_schema=described),
+        [
+            f"{out}: every setting with its default",
+            f"{described}: what editors complete and check it by",
+            f"use it with: rangecheck run SCANS --config {out} --out DIR",
+        ],
+    )
+
+
+def schema(name: str | None) -> Outcome:
+    """The JSON Schema of a document, or of the configuration; without a name, those that there are. Raises SettingError."""
+    known = schemas()
+    if name is None:
+        about = {key: str(found.get("description", found["title"])) for key, found in known.items()}
+        width = max(map(len, known))
+        return Outcome(document("schema", names=about), [f"{key:<{width}}  {said}" for key, said in about.items()])
+    if name not in known:
+        near = difflib.get_close_matches(name, known, n=1)
+        hint = f"did you mean {near[0]}?" if near else "`rangecheck schema` lists them"
+        raise SettingError(f"there is no schema {name!r}; {hint}", key=name)
+    return Outcome(known[name], [json.dumps(known[name], indent=1)])
 
 
 def _section(model: type[BaseModel], name: str) -> Iterator[str]:
