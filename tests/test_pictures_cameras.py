@@ -109,3 +109,48 @@ def test_exr_and_tiff_keep_floats_integers_and_nan(tmp_path):
     (tmp_path / "x.exr").write_bytes(b"no picture")
     with pytest.raises(InputError, match="not a readable EXR"):
         read_exr(tmp_path / "x.exr")
+
+
+@pytest.mark.parametrize("kind", ["orthographic", "cylindrical"])
+def test_maps_are_taken_by_a_camera_without_a_lens_where_the_settings_say_so(kind, tmp_path, capsys):
+    import trimesh
+    from rangecheck_cli.main import exit_status
+
+    from rangecheck.export.map_files import read_maps_npz
+
+    trimesh.creation.icosphere(subdivisions=4, radius=40.0).export(tmp_path / "ball.stl")
+    asked = [
+        "maps",
+        str(tmp_path / "ball.stl"),
+        "--unit",
+        "mm",
+        "--size",
+        "60x48",
+        "--camera",
+        "0,0,200",
+        "--set",
+        f"picture.camera={kind}",
+    ]
+    assert exit_status([*asked, "-o", str(tmp_path / "maps")]) == 0
+    assert f"camera: {kind}" in capsys.readouterr().out
+    maps = read_maps_npz(tmp_path / "maps" / "maps.npz")
+    camera, pose, _ = read_camera_json(tmp_path / "maps" / "camera.json")
+    assert camera == maps.camera and camera.model == kind
+    np.testing.assert_allclose(pose, maps.world_from_camera)
+    # parallel to the axis of view, or square to the upright axis: both have a closed form on the sphere
+    x, y, _ = np.moveaxis(maps.points_mm(), -1, 0)
+    off = np.hypot(x, y) if kind == "orthographic" else np.abs(y)
+    well = off < 30
+    assert well.sum() > 500 and np.isfinite(maps.distance_mm[well]).all()
+    sag = 40 * (1 - np.cos(np.arcsin(1 / 16))) / np.cos(np.arcsin(30 / 40))
+    expected = 200 - np.sqrt(1600 - off[well] ** 2)
+    assert (maps.distance_mm[well] > expected - 1e-4).all() and (maps.distance_mm[well] < expected + 1.5 * sag).all()
+    # right in the picture is right for who stands there, and up is up
+    columns, rows = np.arange(60) - 29.5, np.arange(48) - 23.5
+    front = np.abs(columns) < 10
+    assert (np.sign(x[24, front]) == np.sign(columns[front])).all() and (np.sign(y[8:40, 30]) == -np.sign(rows[8:40])).all()
+    for more, said in (("picture.vignetting=true", "belongs to a lens"), ("picture.pixel_mm=-1", "greater than 0")):
+        assert exit_status([*asked, "--set", more, "-o", str(tmp_path / "other")]) == 2
+        assert said in capsys.readouterr().err
+    assert exit_status(["turntable", *asked[1:4], "--set", f"picture.camera={kind}", "-o", str(tmp_path / "t.mp4")]) == 2
+    assert "needs pinhole" in capsys.readouterr().err

@@ -105,7 +105,8 @@ class Solidify(Section):
         (0.0, 1.0, 0.0), description="away from the build plate: the tilt for which it must drain"
     )
     file_up: Literal["z", "scan"] = Field(
-        "z", description="z: STL and 3MF stand on z = 0 as slicers take them, and are read here as they were; scan: the frame of the scans, y up"
+        "z",
+        description="z: STL and 3MF stand on z = 0 as slicers take them, and are read here as they were; scan: the frame of the scans, y up",
     )
     printer: str | None = Field(None, description="a profile of configs/printers, or a profile file, that the part is judged for")
 
@@ -115,6 +116,14 @@ class Picture(Section):
 
     width: Annotated[int, Field(ge=8, le=16384)] = 512
     height: Annotated[int, Field(ge=8, le=16384)] = 512
+    camera: Literal["pinhole", "orthographic", "cylindrical"] = Field(
+        "pinhole",
+        description="of render, maps and draw; pinhole; orthographic: parallel rays, one scale everywhere; cylindrical: a whole turn around the "
+        "object's upright middle axis, unrolled",
+    )
+    pixel_mm: Positive | None = Field(
+        None, description="width of an orthographic pixel, height of a cylindrical row; without it, such that the object fits"
+    )
     field_of_view_deg: Annotated[float, Field(gt=0.5, lt=150)] = Field(25.0, description="horizontal")
     distortion: Annotated[tuple[float, ...], Field(max_length=8)] = Field(
         (), description="k1 k2 p1 p2 k3 k4 k5 k6, as OpenCV orders them"

@@ -21,7 +21,7 @@ from rangecheck.export.pictures import write_id_png16, write_map_png16, write_pn
 from rangecheck.files import read_bytes, whole_file, write_json
 from rangecheck.maps import Chain, Maps, Shadows
 from rangecheck.maps.shadow import LIT, NOTHING, SHADED, STATE_NAMES, TURNED_AWAY
-from rangecheck.optics import PinholeCamera, camera_from_dict
+from rangecheck.optics import OrthographicCamera, PinholeCamera, camera_from_dict
 
 SCHEMA = "rangecheck/maps/1"
 #: what NumPy and zipfile raise for damaged archives, and for headers that lie
@@ -99,8 +99,9 @@ def write_maps(
         return written[-1]
 
     write_maps_npz(named("maps.npz"), maps, more, force=force)
+    whence = "from the focal point" if isinstance(maps.camera, PinholeCamera) else "along the rays"
     floats = (
-        ("distance", maps.distance_mm, "mm", "Distance from the focal point", "viridis"),
+        ("distance", maps.distance_mm, "mm", f"Distance {whence}", "viridis"),
         ("depth", maps.depth_mm, "mm", "Depth along the optical axis", "viridis"),
         ("incidence", np.degrees(maps.incidence_rad.astype(np.float64)), "deg", "Angle of incidence", "magma"),
     )
@@ -118,7 +119,9 @@ def write_maps(
 
 
 def _pixel_mm(maps: Maps) -> float | None:
-    """Width of a pixel at the median depth of a pinhole camera's picture; None for others and for empty ones."""
+    """Width of a pixel: of an orthographic camera's, or at the median depth of a pinhole's; None for others and for empty pictures."""
+    if isinstance(maps.camera, OrthographicCamera):
+        return maps.camera.pixel_mm
     if isinstance(maps.camera, PinholeCamera) and maps.hit.any():
         return abs(float(np.nanmedian(maps.depth_mm))) / maps.camera.fx or None
     return None

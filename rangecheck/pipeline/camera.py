@@ -10,10 +10,13 @@ import numpy.typing as npt
 
 from rangecheck.arrays import BoolArray, FloatArray
 from rangecheck.config import Settings
+from rangecheck.errors import SettingError
 from rangecheck.export.pictures import develop
 from rangecheck.maps import trace_maps
-from rangecheck.optics import PinholeCamera, Sensor, ThinLens
+from rangecheck.optics import Camera, CylindricalCamera, OrthographicCamera, PinholeCamera, Sensor, ThinLens
 from rangecheck.optics.lens import SHARP_PX
+from rangecheck.rigid import about_axis, inverse, move_points
+from rangecheck.surface import Surface
 from rangecheck.transport import Film, Plan, Tracer
 from rangecheck.transport import render as render_film
 from rangecheck.transport.defocus import defocus
@@ -28,8 +31,8 @@ BACKDROP = 0.05
 class Optics:
     """`camera` is what rays are made by, `asked` what the settings say; they differ where distortion is too small to be seen."""
 
-    camera: PinholeCamera
-    asked: PinholeCamera
+    camera: Camera
+    asked: Camera
     lens: ThinLens | None
     vignetting: bool
     sensor: Sensor | None
@@ -57,15 +60,73 @@ class Optics:
 
 
 def camera_of(settings: Settings) -> PinholeCamera:
-    """The pinhole camera of the settings, with its distortion."""
+    """The pinhole camera of the settings, with its distortion. Raises SettingError where they ask for another."""
     picture = settings.picture
+    if picture.camera != "pinhole":
+        raise SettingError(
+            f"picture.camera is {picture.camera}; render and maps take such pictures (and draw orthographic ones); all else needs pinhole",
+            key="picture.camera",
+        )
     camera = PinholeCamera.from_field_of_view(picture.width, picture.height, picture.field_of_view_deg)
     return replace(camera, distortion=tuple(picture.distortion)) if any(picture.distortion) else camera
 
 
-def optics_of(settings: Settings, camera: PinholeCamera, middle_mm: float) -> Optics:
+def lensless(settings: Settings, surface: Surface, world_from_camera: FloatArray) -> tuple[Camera, FloatArray]:
+    """The orthographic or cylindrical camera of the settings and its pose, for somebody at `world_from_camera` who looks at `surface`.
+
+    The orthographic one is at that pose. The cylindrical one stands upright (y) about the middle of the surface, as far away as that
+    pose, and has its direction in the middle of the picture. Without picture.pixel_mm the surface fills the frame less
+    turntable.margin. Raises SettingError for what only a lens has, and where the surface passes the cylinder."""
+    picture = settings.picture
+    for key, value in (
+        ("distortion", any(picture.distortion)),
+        ("aperture_mm", picture.aperture_mm),
+        ("vignetting", picture.vignetting),
+    ):
+        if value:
+            raise SettingError(
+                f"picture.{key} belongs to a lens; a {picture.camera} camera has none, so leave it out", key=f"picture.{key}"
+            )
+    across, down = (picture.width - 1) / 2, (picture.height - 1) / 2
+    room = 1 - 2 * settings.turntable.margin
+    points = surface.vertices[np.unique(surface.faces)]
+    if picture.camera == "orthographic":
+        seen = np.abs(move_points(inverse(world_from_camera), points)[:, :2]).max(axis=0)
+        pixel = picture.pixel_mm or 2 * float((seen / (picture.width, picture.height)).max()) / room or 1.0
+        return OrthographicCamera(picture.width, picture.height, pixel, across, down), world_from_camera
+    middle = surface.bounds_mm.mean(axis=0)
+    away = world_from_camera[:3, 3] - middle
+    radius, front = float(np.hypot(away[0], away[2])), float(np.arctan2(away[0], away[2]))
+    reach = float(np.hypot(points[:, 0] - middle[0], points[:, 2] - middle[2]).max())
+    if radius <= reach:
+        raise SettingError(
+            f"the cylindrical camera is {radius:.4g} mm from the upright axis through the object, which reaches {reach:.4g} mm; "
+            "move it out with --camera",
+            key="picture.camera",
+        )
+    row = picture.pixel_mm or float(np.ptp(points[:, 1])) / (picture.height * room) or 1.0
+    # columns run to the right of who looks inwards, which is against the camera frame's sense with its y down
+    step = -2 * np.pi / picture.width
+    pose = about_axis((0.0, 1.0, 0.0), front) @ np.diag([-1.0, -1.0, 1.0, 1.0])
+    pose[:3, 3] = middle
+    return CylindricalCamera(picture.width, picture.height, radius, step, row, down, -across * step), pose
+
+
+def optics_of(settings: Settings, camera: Camera, middle_mm: float) -> Optics:
     """What the settings ask of lens and sensor, for a camera `middle_mm` before the object's middle."""
     picture, sensing, reasons = settings.picture, settings.sensor, []
+    sensor = None
+    if sensing.noise:
+        sensor = Sensor(
+            full_well=sensing.full_well,
+            read_noise=sensing.read_noise,
+            dark_electrons=sensing.dark_electrons,
+            bits=sensing.bits,
+            response=sensing.response,
+            gamma=sensing.gamma,
+        )
+    if not isinstance(camera, PinholeCamera):
+        return Optics(camera, camera, None, False, sensor)
     shift, used = camera.distortion_px(), camera
     if any(camera.distortion):
         if shift <= STRAIGHT_PX:
@@ -78,16 +139,6 @@ def optics_of(settings: Settings, camera: PinholeCamera, middle_mm: float) -> Op
         focus = picture.focus_mm or middle_mm
         rim = {} if picture.rim_mm is None else {"rim_mm": picture.rim_mm, "rim_distance_mm": picture.rim_distance_mm}
         lens = ThinLens(used, picture.aperture_mm, focus, picture.focal_length_mm, **rim)
-    sensor = None
-    if sensing.noise:
-        sensor = Sensor(
-            full_well=sensing.full_well,
-            read_noise=sensing.read_noise,
-            dark_electrons=sensing.dark_electrons,
-            bits=sensing.bits,
-            response=sensing.response,
-            gamma=sensing.gamma,
-        )
     return Optics(used, camera, lens, picture.vignetting, sensor, tuple(reasons))
 
 

@@ -12,11 +12,11 @@ from rangecheck.config import Settings
 from rangecheck.errors import OutputError
 from rangecheck.export.camera_files import write_camera_json, write_colmap, write_opencv_yaml
 from rangecheck.export.pictures import exposure_from, write_png
-from rangecheck.optics import PinholeCamera
+from rangecheck.optics import Camera, PinholeCamera
 from rangecheck.pipeline.camera import developed, image_of, optics_of, take
 from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.subject import Subject, read_subject
-from rangecheck.pipeline.views import refuse_existing, view_of
+from rangecheck.pipeline.views import refuse_existing, seen_by, view_of
 from rangecheck.progress import Reporter
 from rangecheck.reflectance import Material, load_material
 from rangecheck.scene import Scene, Source, gradient, studio
@@ -51,7 +51,7 @@ def scene_of(subject: Subject, material: Material, *, direct: bool = False, stri
     return studio(surface, material, ("dark" if direct else "plaster") if matt else "steel", smooth=True, front=front)
 
 
-def plan_of(tracer: Tracer, camera: PinholeCamera, pose: FloatArray, settings: Settings) -> Plan:
+def plan_of(tracer: Tracer, camera: Camera, pose: FloatArray, settings: Settings) -> Plan:
     """How the light of this picture is followed, and why so; pictures have a backdrop of their own instead of the surroundings."""
     light = settings.light
     if light.model == "direct":
@@ -102,9 +102,11 @@ def render(
     write_png(out, developed(image_of(film, optics), exposure, optics, settings.seed), force=force)
     beside = Path(out)
     write_camera_json(beside.with_suffix(".camera.json"), camera, pose, {"exposure": exposure, **optics.to_dict()})
-    write_opencv_yaml(beside.with_suffix(".opencv.yaml"), camera, pose)
-    write_colmap(beside.with_suffix(".colmap"), [camera], [pose], [beside.name.replace(" ", "_")])
-    explained = [*plan.explain(), *optics.reasons, *said]
+    if isinstance(camera, PinholeCamera):
+        # the others know no other camera
+        write_opencv_yaml(beside.with_suffix(".opencv.yaml"), camera, pose)
+        write_colmap(beside.with_suffix(".colmap"), [camera], [pose], [beside.name.replace(" ", "_")])
+    explained = [line for line in (*plan.explain(), seen_by(camera), *optics.reasons, *said) if line]
     lines = [f"{out}: {camera.width}x{camera.height}, {material.name}, mean radiance {film.mean_radiance:.4g}", *explained]
     return Outcome(
         document("render", output=out, material=material.name, camera=camera.to_dict(), world_from_camera=pose, exposure=exposure,

@@ -22,8 +22,8 @@ from rangecheck.maps import (
     trace_maps,
     trace_shadows,
 )
-from rangecheck.optics import PinholeCamera
-from rangecheck.pipeline.camera import camera_of
+from rangecheck.optics import Camera, CylindricalCamera, OrthographicCamera
+from rangecheck.pipeline.camera import camera_of, lensless
 from rangecheck.pipeline.folder import check_free, check_writable
 from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.subject import Subject, read_subject
@@ -47,18 +47,31 @@ def orbit_of(surface: Surface, settings: Settings) -> Orbit:
     )
 
 
-def view_of(subject: Subject, settings: Settings, camera_mm: tuple[float, ...] | None) -> tuple[PinholeCamera, FloatArray]:
+def view_of(subject: Subject, settings: Settings, camera_mm: tuple[float, ...] | None) -> tuple[Camera, FloatArray]:
     """The camera and its pose: at `camera_mm` looking at the middle of the object; else as a modelled scene's own file says; else
-    the first view of the orbit. Raises SceneError when that is inside the object."""
-    camera, surface, model = camera_of(settings), subject.surface, subject.model
+    the first view of the orbit of a pinhole. Raises SceneError when that is inside the object."""
+    kind, surface, model = settings.picture.camera, subject.surface, subject.model
+    pinhole = settings.model_copy(update={"picture": settings.picture.model_copy(update={"camera": "pinhole"})})
+    camera: Camera = camera_of(pinhole)
     if camera_mm is not None:
         pose = look_at(camera_mm, surface.bounds_mm.mean(axis=0))
     elif model is not None and model.camera is not None and model.world_from_camera is not None:
         camera, pose = model.camera, model.world_from_camera
     else:
-        pose = orbit_of(surface, settings).world_from_camera(0)
+        pose = orbit_of(surface, pinhole).world_from_camera(0)
+    if kind != "pinhole":
+        camera, pose = lensless(settings, surface, pose)
     require_outside(surface, camera, pose)
     return camera, pose
+
+
+def seen_by(camera: Camera) -> str:
+    """A camera without a lens in words; nothing of a pinhole, which everybody expects."""
+    if isinstance(camera, OrthographicCamera):
+        return f"camera: orthographic, pixels of {camera.pixel_mm:.4g} mm"
+    if isinstance(camera, CylindricalCamera):
+        return f"camera: cylindrical, a whole turn at {camera.radius_mm:.4g} mm from the axis, rows of {camera.row_mm:.4g} mm"
+    return ""
 
 
 def refuse_existing(path: str | Path, force: bool) -> None:
@@ -114,7 +127,8 @@ def maps(
     with reporter.stage("writing"):
         eye = ", ".join(f"{x:.0f}" for x in pose[:3, 3])
         more = {} if apart is None else {"deviation_mm": apart.distance_mm}
-        written = write_maps(out, measured, subtitle=f"focal point at ({eye}) mm", more=more)
+        subtitle = f"focal point at ({eye}) mm" if camera.model == "pinhole" else f"{camera.model} camera at ({eye}) mm"
+        written = write_maps(out, measured, subtitle=subtitle, more=more)
         if apart is not None and other is not None:
             written += write_value_map(
                 out, "deviation", apart.distance_mm, f"Deviation from {other.name}, positive outside", "mm", signed=True
@@ -130,6 +144,7 @@ def maps(
         f"{out}: {len(written) + 1} files; distances {nearest:.2f} to {farthest:.2f} mm over {int(measured.hit.sum()):,} pixels",
         f"projected back, no point lies further than {proof.distance_max_mm:.2g} mm from the surface (bound {proof.bound_mm:.2g} mm)",
     ]
+    lines += [said for said in [seen_by(camera)] if said]
     if apart is not None and other is not None:
         lines += _apart(apart, other.name)
     if model is not None:
@@ -191,6 +206,9 @@ def draw(
         raise InputError(
             path, "is no modelled scene; a line drawing needs faces that know their edges, as a scene's .toml file gives them"
         )
+    if settings.picture.camera != "orthographic":
+        # lines stay straight in these two alone
+        camera_of(settings)
     camera, pose = view_of(subject, settings, camera_mm)
     with reporter.stage("drawing"):
         drawing = draw_lines(subject.model, camera, pose, hidden=hidden)
