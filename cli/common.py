@@ -78,6 +78,11 @@ _OPTIONS: dict[str, Callable[..., Any]] = {
     ),
     "seed": click.option("--seed", type=click.IntRange(0), help="Seed of every random number."),
     "config": click.option("--config", metavar="FILE", help="Settings: a TOML file or a preset (quick, normal, fine)."),
+    "preset": click.option(
+        "--preset",
+        type=click.Choice(["quick", "normal", "fine"]),
+        help="Settings to start from; --config and --set go over them.",
+    ),
     "set": click.option(
         "--set", "assignments", multiple=True, metavar="KEY=VALUE", help="One setting, for example turntable.frames=72."
     ),
@@ -253,8 +258,8 @@ class ConsoleReporter(Reporter):
             self._bar = None
 
 
-def settings_from(config: str | None, assignments: tuple[str, ...], **overrides: Any) -> Any:
+def settings_from(config: str | None, assignments: tuple[str, ...], preset: str | None = None, **overrides: Any) -> Any:
     """Resolved settings; dunder names in `overrides` stand for dots (turntable__frames)."""
     from rangecheck.config import load_settings
 
-    return load_settings(config, assignments, {key.replace("__", "."): value for key, value in overrides.items()})
+    return load_settings(config, assignments, {key.replace("__", "."): value for key, value in overrides.items()}, preset)

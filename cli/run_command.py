@@ -16,7 +16,7 @@ from .common import common, settings_from
     help="Make the frames, or with --each the subjects, on a dask cluster, for example tcp://10.0.0.1:8786.",
 )
 @click.option("--dry-run", is_flag=True, help="Check inputs, settings, encoder and room on the disk; compute nothing.")
-@common("out", "register", "filter", "refine", "unit", "size", "frames", "tolerance", "seed", "config", "set", "force")
+@common("out", "register", "filter", "refine", "unit", "size", "frames", "tolerance", "seed", "preset", "config", "set", "force")
 def command(
     scans,
     method,
@@ -30,6 +30,7 @@ def command(
     frames,
     tolerance,
     seed,
+    preset,
     config,
     assignments,
     force,
@@ -44,10 +45,12 @@ def command(
     what is really solid), plaster.mp4, steel.mp4, maps, report.html and run.json. A run that was stopped goes on where it was.
     """
     from rangecheck.pipeline import rehearse, run, run_each
+    from rangecheck.pipeline.presets import with_gain
 
     settings = settings_from(
         config,
         assignments,
+        preset,
         meshing__method=method,
         scan__registration=register,
         scan__filters=filters or None,
@@ -63,5 +66,7 @@ def command(
         if each:
             raise click.UsageError("--dry-run looks at one subject; leave --each away")
         return rehearse(scans, out, settings=settings, unit=unit, force=force, reporter=reporter)
-    work = run_each if each else run
-    return work(scans, out, settings=settings, unit=unit, force=force, reporter=reporter, scheduler=scheduler)
+    if each:
+        return run_each(scans, out, settings=settings, unit=unit, force=force, reporter=reporter, scheduler=scheduler)
+    outcome = run(scans, out, settings=settings, unit=unit, force=force, reporter=reporter, scheduler=scheduler)
+    return with_gain(outcome, settings)

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from rangecheck import rigid
+from rangecheck.config import load_settings
 from rangecheck.export.meshes import write_mesh
 from rangecheck.pipeline.job_study import _labelled, error_of
+from rangecheck.pipeline.presets import PRESETS, finer_than, measured
 from rangecheck.scan.sample import sample_view
 from rangecheck.surface import INVENTED, MEASURED, Surface
 
@@ -49,3 +51,24 @@ def test_what_a_job_wrote_is_read_with_its_labels(truth, tmp_path):
     assert found.part_names == ("surface", "base")
     np.testing.assert_array_equal(found.origin_of_face, origin)
     np.testing.assert_array_equal(found.part_of_face, part)
+
+
+def test_every_preset_has_its_measured_figures_and_says_what_the_next_one_gains():
+    figures = measured()
+    assert [figures[name]["rms_mm"] for name in PRESETS] == sorted((figures[name]["rms_mm"] for name in PRESETS), reverse=True)
+    assert [figures[name]["seconds"] for name in PRESETS] == sorted(figures[name]["seconds"] for name in PRESETS)
+    said = finer_than(load_settings())
+    assert said and "--preset fine" in said and f"{figures['fine']['rms_mm']:.3f}" in said
+    assert "finest" in (finer_than(load_settings("fine")) or "")
+    assert finer_than(load_settings(None, ["meshing.voxel_mm=3"])) is None
+
+
+def test_a_file_goes_over_the_preset_that_it_starts_from(tmp_path):
+    file = tmp_path / "job.toml"
+    file.write_text("[turntable]\nframes = 5\n")
+    settings = load_settings(file, preset="fine")
+    assert (settings.turntable.frames, settings.turntable.fps, settings.picture.width) == (
+        5,
+        24,
+        load_settings("fine").picture.width,
+    )

@@ -19,6 +19,7 @@ from rangecheck.arrays import FloatArray
 from rangecheck.config import load_settings
 from rangecheck.pipeline.job import run
 from rangecheck.pipeline.preparing import prepared
+from rangecheck.pipeline.presets import PRESETS
 from rangecheck.pipeline.shape import solid_of
 from rangecheck.pipeline.subject import eye_of, read_all_scans, surface_of
 from rangecheck.progress import Reporter
@@ -26,7 +27,6 @@ from rangecheck.scan.sample import make_sample_data
 from rangecheck.study import Measurement, Part, SpeedChart, peak_memory_mb, study_of_parts
 from rangecheck.surface import MEASURED, Surface
 
-PRESETS = ("quick", "normal", "fine")
 #: fusion cells in sample spacings
 CELLS = (4.0, 3.0, 2.0, 1.5, 1.0, 0.8)
 POINTS = 100_000
