@@ -74,7 +74,7 @@ Chart = SpeedChart | EdgeChart | LineChart
 
 @dataclass(frozen=True)
 class Study:
-    """`findings` are sentences with numbers; `tables` are lists of rows by name."""
+    """`findings` are sentences with numbers; `tables` are lists of rows by name; `pictures` are PNG files by slug."""
 
     name: str
     title: str
@@ -82,6 +82,7 @@ class Study:
     findings: Sequence[str] = ()
     tables: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
     machine: dict[str, Any] = field(default_factory=describe_machine)
+    pictures: dict[str, bytes] = field(default_factory=dict, repr=False)
 
     def document(self) -> dict[str, Any]:
         """The study as plain JSON values, with null for what is not a number."""
@@ -144,4 +145,7 @@ def write_study(study: Study, folder: str | Path, *, force: bool = True) -> list
             path = folder / f"{study.name}-{chart.slug}.{kind}"
             write_bytes(path, draw(chart, study.machine, kind), force=force)
             written.append(path)
+    for slug, picture in study.pictures.items():
+        written.append(folder / f"{study.name}-{slug}.png")
+        write_bytes(written[-1], picture, force=force)
     return written

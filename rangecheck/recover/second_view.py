@@ -1,0 +1,186 @@
+"""Does the scan explain a second photograph? The picture on the scan's own grid, carried by the scan's shape into another camera, must be what that
+camera saw: paint, which hides shape from shading, is here what shows it.
+
+A range that is wrong by d moves its place in the second picture along the epipolar line. Per cell the offset d is taken at which the two pictures,
+in logarithms of light, correlate best over a Gaussian window (normalised cross-correlation, so that each window has its own gain), between the offsets
+tried by a parabola. Where paint has no structure, or the cameras see a gloss, they do not correlate and the place is not judged.
+
+Places are named by the jump of d: the largest difference between its means over two halves of a disc, over all directions. Slow changes of d are the
+calibration's; a dent has a ring of jumps, two badly joined pieces a line of them. The noise is that of the jump over the picture itself (median
+absolute), and the level is Bonferroni's for as many places as discs fit into what is judged. Its tails are longer than a normal one's, so nothing below
+LEAST_MM is named either. Scan frame, millimetres.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from statistics import NormalDist
+
+import numpy as np
+
+from rangecheck import rigid
+from rangecheck.arrays import BoolArray, FloatArray
+from rangecheck.errors import ScanError
+from rangecheck.recover.compare import Region, inner
+from rangecheck.recover.grid import scan_grid
+from rangecheck.scan import RangeScan
+from rangecheck.scan.decode import View
+
+#: Gaussian window of the correlation and radius of the disc, mm;  offsets tried, mm
+WINDOW_MM, DISC_MM, REACH_MM, OFFSET_MM = 2.0, 5.0, 1.6, 0.2
+#: jumps below this are not named;  chance of one false name per scan that the level is for
+LEAST_MM, CHANCE = 0.15, 0.01
+#: correlation from which a window is believed, and share of a half disc that must be judged
+_CORRELATED, _FILLED = 0.85, 0.5
+_DIRECTIONS = 8
+#: regions this many times longer than wide are lines: steps between surfaces
+_LINE = 3.0
+_NORMAL_MAD = 0.6744897501960817
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """offset_mm (h, w) by which the range would have to change, NaN where not judged;  jump_mm (h, w);  noise_mm: of the jump;  level_mm: above which a
+    place is named;  places: discs that fit into what is judged;  judged: its share of the valid cells;  spacing_mm, step: of the grid;  regions, the largest
+    jump first"""
+
+    offset_mm: FloatArray
+    jump_mm: FloatArray
+    noise_mm: float
+    level_mm: float
+    places: int
+    judged: float
+    spacing_mm: float
+    step: int
+    regions: tuple[Region, ...]
+
+
+def second_view(scan: RangeScan, picture: FloatArray, view: View, *, step: int = 1) -> Agreement:
+    """The scan with its brightness against `picture` (h, w), any scale of light, taken by `view` under the same lamp.
+
+    step: rows and columns averaged to one. Raises ScanError where the scan has no brightness or the two see nothing alike."""
+    from scipy.ndimage import gaussian_filter, map_coordinates
+
+    if picture.shape != (view.camera.height, view.camera.width):
+        raise ScanError(
+            f"{scan.name}: the second picture is {picture.shape[1]} x {picture.shape[0]}, its camera {view.camera.width} x {view.camera.height}; "
+            "give the camera of this picture"
+        )
+    grid = scan_grid(scan, step)
+    rows, columns = (np.flatnonzero(grid.valid.any(axis=axis)) for axis in (1, 0))
+    held = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
+    valid, sigma = grid.valid[held], WINDOW_MM / grid.spacing_mm
+    weight = valid.astype(float)
+    norm = gaussian_filter(weight, sigma)[valid]
+
+    def mean(values: FloatArray) -> FloatArray:
+        spread = np.zeros(valid.shape)
+        spread[valid] = values
+        return np.asarray(gaussian_filter(spread, sigma)[valid] / norm)
+
+    points, rays = grid.points[grid.valid], grid.rays[grid.valid]
+    other = rigid.inverse(view.world_from_camera) @ scan.world_from_scan
+    at, _ = view.camera.project(rigid.move_points(other, points))
+    ahead, _ = view.camera.project(rigid.move_points(other, points + rays))
+    inside = (at >= 0) & (at <= np.array(picture.shape[::-1]) - 1.0)
+    seen: BoolArray = np.asarray((np.isfinite(ahead) & inside).all(axis=1))
+    at, along = np.where(seen[:, None], at, 0.0), np.where(seen[:, None], ahead - at, 0.0)
+    # as coarse as the grid's own cells, whose picture is the mean of step x step
+    light = gaussian_filter(picture.astype(float), 0.5 * step)
+    floor = max(1e-3 * float(light.max()), 1e-12)
+    own = np.log(np.maximum(np.nan_to_num(grid.picture[grid.valid]), 1e-3))
+    own_mean = mean(own)
+    own_spread = mean(own**2) - own_mean**2
+    offsets = np.arange(-REACH_MM, REACH_MM + 0.5 * OFFSET_MM, OFFSET_MM)
+    match = np.empty((len(offsets), len(points)))
+    for k, offset in enumerate(offsets):
+        u, v = (at + offset * along).T
+        there = np.log(np.maximum(map_coordinates(light, [v, u], order=1, mode="nearest"), floor))
+        there_mean = mean(there)
+        spread = own_spread * (mean(there**2) - there_mean**2)
+        match[k] = (mean(own * there) - own_mean * there_mean) / np.sqrt(np.maximum(spread, 1e-18))
+    best = match.argmax(axis=0)
+    between = np.clip(best, 1, len(offsets) - 2)
+    cell = np.arange(len(points))
+    before, peak, after = (match[between + d, cell] for d in (-1, 0, 1))
+    bend = before - 2.0 * peak + after
+    believed = seen & (best == between) & (peak > _CORRELATED) & (bend < 0.0)
+    if not believed.any():
+        raise ScanError(
+            f"{scan.name}: the two pictures agree nowhere; check that both show this scan under one lamp, and the camera"
+        )
+    found = offsets[between] + 0.5 * OFFSET_MM * (before - after) / np.where(bend < 0.0, bend, -1.0)
+    offset_mm = np.full(grid.valid.shape, np.nan)
+    offset_mm[grid.valid] = np.where(believed, found, np.nan)
+    # windows at rims are one-sided
+    offset_mm[~inner(grid.valid, 0.5 * sigma)] = np.nan
+    return _judged(grid.points, offset_mm, grid.valid, held, step, grid.spacing_mm)
+
+
+def _judged(
+    points: FloatArray, offset_mm: FloatArray, valid: BoolArray, held: tuple[slice, slice], step: int, spacing_mm: float
+) -> Agreement:
+    jump = np.full(valid.shape, np.nan)
+    jump[held] = jumps(offset_mm[held], DISC_MM / spacing_mm)
+    known = np.isfinite(jump)
+    count = int(known.sum())
+    places = max(1, round(count * spacing_mm**2 / (math.pi * DISC_MM**2)))
+    noise = float(np.median(jump[known])) / _NORMAL_MAD if count else math.nan
+    # the jump is the largest of several directions, each of either sign
+    level = max(LEAST_MM, noise * NormalDist().inv_cdf(1.0 - CHANCE / (2.0 * _DIRECTIONS * places)))
+    regions = _regions(points, jump, level, noise, spacing_mm)
+    return Agreement(offset_mm, jump, noise, level, places, count / max(1, int(valid.sum())), spacing_mm, step, regions)
+
+
+def jumps(values: FloatArray, radius: float) -> FloatArray:
+    """(h, w) the largest absolute difference of means over two halves of a disc (radius in cells), NaN where a half is not filled."""
+    from scipy.signal import fftconvolve
+
+    reach = math.ceil(radius)
+    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    disc = np.hypot(x, y) <= radius
+    known = np.isfinite(values)
+    filled, weight = np.where(known, values, 0.0), known.astype(float)
+    largest = np.full(values.shape, np.nan)
+    for angle in np.arange(_DIRECTIONS) * math.pi / _DIRECTIONS:
+        side = math.cos(angle) * x + math.sin(angle) * y
+        means, full = [], known.copy()
+        for half in (disc & (side > 0.5), disc & (side < -0.5)):
+            kernel = half[::-1, ::-1].astype(float)
+            count = fftconvolve(weight, kernel, mode="same")
+            means.append(fftconvolve(filled, kernel, mode="same") / np.maximum(count, 0.5))
+            full &= count > _FILLED * half.sum()
+        largest = np.fmax(largest, np.where(full, np.abs(means[0] - means[1]), np.nan))
+    return largest
+
+
+def _regions(points: FloatArray, jump: FloatArray, level: float, noise: float, spacing_mm: float) -> tuple[Region, ...]:
+    from scipy.ndimage import label
+
+    high = np.nan_to_num(jump) > level
+    spots, count = label(high, np.ones((3, 3)))
+    found = []
+    for k in range(1, count + 1):
+        rows, columns = np.nonzero(spots == k)
+        # a jump is as wide as its disc: less is the picture's grain
+        if len(rows) * spacing_mm**2 < 0.25 * math.pi * WINDOW_MM**2:
+            continue
+        here = points[rows, columns]
+        middle = np.median(here, axis=0)
+        spread = np.linalg.svd(here - here.mean(axis=0), compute_uv=False) / math.sqrt(len(here))
+        length, width = (2.0 * math.sqrt(3.0) * float(s) for s in spread[:2])
+        worst = int(np.argmax(jump[rows, columns]))
+        found.append(
+            Region(
+                "registration" if length > _LINE * max(width, spacing_mm) else "shape",
+                (float(middle[0]), float(middle[1]), float(middle[2])), len(rows) * spacing_mm**2, length, width,
+                float(jump[rows[worst], columns[worst]]) / noise, (int(rows[worst]), int(columns[worst])),
+            )
+        )  # fmt: skip
+    return tuple(sorted(found, key=lambda region: -region.z))
+
+
+def named_cells(agreement: Agreement) -> BoolArray:
+    """(h, w) cells above the level."""
+    return np.asarray(np.nan_to_num(agreement.jump_mm) > agreement.level_mm)

@@ -1,0 +1,173 @@
+"""Faults planted in a real scan, looked for with the photographs that it was decoded from: are they named, where, and what else is?
+
+The scan is the structured-light bust of the real data, in the left camera's frame; its picture under the white projector lies on its grid. First material
+and lamp are fitted to that picture, and it is said how much of the picture they explain: paint decides what shading can show. Then the scan is held against the
+right camera's picture. Places and directions of what is planted are drawn from a seed among the places that the unaltered scan is judged at.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from rangecheck.arrays import FloatArray
+from rangecheck.export.mapped import coloured_map
+from rangecheck.export.pictures import png_bytes
+from rangecheck.optics import Sensor
+from rangecheck.recover.fit import Fitted
+from rangecheck.recover.grid import ScanGrid, masked_gauss, normals_at, scan_grid
+from rangecheck.recover.lamp import lamp_of
+from rangecheck.recover.second_view import DISC_MM, WINDOW_MM, Agreement, second_view
+from rangecheck.recover.shading import shading_of
+from rangecheck.scan import RangeScan
+from rangecheck.scan.decode import Capture, decode_gray_code, read_capture
+from rangecheck.studies.bust_scans import real_data
+from rangecheck.study import Line, LineChart
+
+_STEP, _SEED, _APART_MM = 3, 20, 25.0
+#: dents (depth, radius) and steps, mm
+_DENTS = ((1.0, 8.0), (1.0, 4.0), (0.5, 8.0), (0.25, 8.0))
+_STEPS = (0.3, 0.2)
+_FACING, _NORMALS_MM = 0.3, 2.0
+
+
+def dented(scan: RangeScan, centre_mm: FloatArray, depth_mm: float, radius_mm: float) -> RangeScan:
+    """The scan with a dent, a raised cosine in range, about a place of its own frame."""
+    apart = np.linalg.norm(scan.grid_points_mm - centre_mm, axis=-1) / radius_mm
+    deeper = np.where(apart < 1.0, 0.5 * depth_mm * (1.0 + np.cos(math.pi * np.minimum(apart, 1.0))), 0.0)
+    return replace(scan, range_mm=(scan.range_mm + deeper).astype(np.float32))
+
+
+def stepped(scan: RangeScan, centre_mm: FloatArray, angle: float, step_mm: float) -> RangeScan:
+    """The scan with all that lies on one side of a line through a place further away."""
+    beyond = _along(scan.grid_points_mm, centre_mm, angle) > 0.0
+    return replace(scan, range_mm=(scan.range_mm + np.where(beyond, step_mm, 0.0)).astype(np.float32))
+
+
+def _along(points: FloatArray, centre_mm: FloatArray, angle: float) -> FloatArray:
+    """Distance (signed, mm, across the view) from the line through a place."""
+    from_centre = points[..., :2] - centre_mm[:2]
+    return np.asarray(math.cos(angle) * from_centre[..., 0] + math.sin(angle) * from_centre[..., 1])
+
+
+def alexander_scan(capture: Capture) -> RangeScan:
+    """The decoded scan, its picture linear in light."""
+    assert capture.right is not None and capture.right_view is not None
+    scan = decode_gray_code(capture.left, capture.left_view, capture.right, capture.right_view, name="alexander").scan
+    assert scan.brightness is not None
+    return replace(scan, brightness=Sensor(bits=0, response="srgb").linearise(scan.brightness).astype(np.float32))
+
+
+def places_of(scan: RangeScan, found: Agreement, count: int, seed: int) -> FloatArray:
+    """(k, 3) judged places of the scan, drawn from a seed, at least _APART_MM apart and a dent's radius inside what is judged."""
+    from scipy.ndimage import distance_transform_edt
+
+    points = scan_grid(scan, found.step).points
+    inside = distance_transform_edt(np.isfinite(found.offset_mm)) * found.spacing_mm
+    cells = np.argwhere(np.isfinite(found.jump_mm) & (inside > DISC_MM))
+    chosen: list[FloatArray] = []
+    for row, column in np.random.default_rng(seed).permutation(cells):
+        place = points[row, column]
+        if all(np.linalg.norm(place - other) > _APART_MM for other in chosen):
+            chosen.append(place)
+        if len(chosen) == count:
+            break
+    return np.array(chosen)
+
+
+def shading_explained(scan: RangeScan) -> tuple[Fitted, FloatArray, dict[str, float]]:
+    """Material and lamp on the scan's own surface; (h, w) ln seen/predicted; spreads (robust) of picture, of the prediction and of what is left in
+    the scale of a dent, 4 to 12 mm."""
+    grid: ScanGrid = scan_grid(scan, _STEP)
+    normals = normals_at(grid, _NORMALS_MM)
+    facing = np.nan_to_num(-(normals * grid.rays).sum(-1))
+    cell = np.flatnonzero(np.isfinite(normals).all(axis=-1) & (facing > _FACING))
+    chosen = normals.reshape(-1, 3)[cell]
+    fitted = lamp_of(grid, cell, chosen)
+    shown = np.full(grid.valid.size, np.nan)
+    shown[cell] = shading_of(fitted, grid, cell).at(chosen)[0]
+    predicted: FloatArray = shown.reshape(grid.valid.shape)
+    known = (np.nan_to_num(predicted) > 0.0) & (np.nan_to_num(grid.picture) > 0.0)
+    logs = {"picture": grid.picture, "shading": predicted}
+    bands = {}
+    for name, values in logs.items():
+        level = np.log(np.where(known, values, 1.0))
+        fine, broad = (masked_gauss(level, known.astype(float), mm / grid.spacing_mm) for mm in (2.0, 6.0))
+        bands[name] = (fine - broad)[known]
+    bands["left"] = bands["picture"] - bands["shading"]
+    spreads = {name: float(np.median(np.abs(v)) / 0.6744897501960817) for name, v in bands.items()}
+    return fitted, np.where(known, np.log(np.where(known, grid.picture, 1.0) / np.where(known, predicted, 1.0)), np.nan), spreads
+
+
+def alexander(quick: bool) -> tuple[list[Any], list[str], list[dict[str, Any]], dict[str, bytes]]:
+    """The part `alexander` of the study `fit`."""
+    capture = read_capture(real_data("alexander_bust"))
+    scan = alexander_scan(capture)
+    assert capture.right is not None and capture.right_view is not None
+    right, view = Sensor(bits=0, response="srgb").linearise(capture.right.white / capture.right.full_scale), capture.right_view
+    fitted, residual, spreads = shading_explained(scan)
+    light = fitted.problem.lights[0]
+    towards = ", ".join(f"{v:.3f}" for v in light.direction)
+    clean = second_view(scan, right, view, step=_STEP)
+    points = scan_grid(scan, _STEP).points
+    findings = [
+        f"left picture: lamp towards {towards} (scan's frame), {light.distance_mm:.3g} mm away, K_lm {fitted.problem.material.K_lm:.3f}, K_lobe "
+        f"{fitted.problem.material.K_lobe:.3f}",
+        f"in structures of a dent's size the picture varies by {spreads['picture']:.1%}, the fitted shading by {spreads['shading']:.1%}, what is left by "
+        f"{spreads['left']:.1%}: paint hides shape from shading alone",
+        f"second view: {clean.judged:.0%} of the scan judged, noise of a jump {clean.noise_mm:.3f} mm, named from {clean.level_mm:.3f} mm",
+        f"unaltered scan: {len(clean.regions)} places named of {clean.places} judged discs of {DISC_MM:g} mm radius",
+    ]
+    rows: list[dict[str, Any]] = [{"planted": "nothing", "named": [vars(r) for r in clean.regions]}]
+    places = places_of(scan, clean, 3 if quick else 6, _SEED)
+    shares: list[float] = []
+    for depth, radius in _DENTS[:1] if quick else _DENTS:
+        planted = scan
+        for place in places:
+            planted = dented(planted, place, depth, radius)
+        found = second_view(planted, right, view, step=_STEP)
+        named, others = 0, list(found.regions)
+        for place in places:
+            here = [r for r in found.regions if np.linalg.norm(points[r.cell] - place) < radius + DISC_MM]
+            others = [r for r in others if r not in here]
+            named += bool(here)
+            rows.append(
+                {"planted": "dent", "depth_mm": depth, "radius_mm": radius, "place_mm": place, "named": [vars(r) for r in here]}
+            )
+        kinds = [r["kind"] for row in rows[-len(places) :] for r in row["named"]]
+        shares.append(named / len(places))
+        findings.append(
+            f"dents {depth:g} mm deep, radius {radius:g} mm: {named} of {len(places)} named ({kinds.count('shape')} of {len(kinds)} regions as shape); "
+            f"{len(others)} places named elsewhere"
+        )
+    rng = np.random.default_rng(_SEED)
+    for step in _STEPS[:1] if quick else _STEPS:
+        named = as_step = elsewhere = 0
+        for place in places:
+            angle = float(rng.uniform(0.0, math.pi))
+            found = second_view(stepped(scan, place, angle, step), right, view, step=_STEP)
+            on = [r for r in found.regions if abs(_along(points[r.cell], place, angle)) < DISC_MM + WINDOW_MM]
+            named += bool(on)
+            as_step += any(r.kind == "registration" for r in on)
+            elsewhere += len(found.regions) - len(on)
+            rows.append(
+                {"planted": "step", "step_mm": step, "angle": angle, "place_mm": place, "named": [vars(r) for r in found.regions]}
+            )
+        findings.append(
+            f"registration steps of {step:g} mm: {named} of {len(places)} named on their line, {as_step} with a region classed as registration; {elsewhere} "
+            f"places named elsewhere, in {len(places)} scans"
+        )
+    depths = [d for d, r in _DENTS if r == _DENTS[0][1]]
+    of = [share for share, (_, r) in zip(shares, _DENTS) if r == _DENTS[0][1]]
+    chart = LineChart(
+        "dents", f"Dents of {_DENTS[0][1]:g} mm radius named, by depth", "depth, mm", "share named",
+        [Line("second view", depths[: len(of)], of, True)],
+    )  # fmt: skip
+    pictures = {
+        "residual": png_bytes(coloured_map(residual, "Brightness, seen over predicted", "ln", low=-1.0, high=1.0)),
+        "offset": png_bytes(coloured_map(clean.offset_mm, "Range by the second picture", "mm", low=-0.5, high=0.5)),
+    }
+    return [chart], findings, rows, pictures
