@@ -10,6 +10,7 @@ import json
 import os
 import re
 import tempfile
+import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -51,10 +52,15 @@ def whole_file(path: str | Path, *, force: bool = True) -> Iterator[Path]:
             part.unlink(missing_ok=True)
 
 
+def is_part(path: Path) -> bool:
+    """Whether `whole_file` was, or is, writing it."""
+    return _PART.fullmatch(path.name) is not None and path.is_file()
+
+
 def sweep_parts(folder: str | Path) -> None:
     """Remove what `whole_file` left below `folder` when its process was killed; call it only where nobody else writes."""
     for path in Path(folder).rglob(".*.part*"):
-        if _PART.fullmatch(path.name) and path.is_file():
+        if is_part(path):
             path.unlink(missing_ok=True)
 
 
@@ -85,6 +91,14 @@ def read_json(path: str | Path) -> Any:
         return json.loads(read_bytes(path), parse_constant=refuse)
     except (ValueError, RecursionError) as error:
         raise InputError(path, f"is not valid JSON ({error}); correct it and try again") from None
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """The tables in a TOML file. Raises InputError."""
+    try:
+        return tomllib.loads(read_bytes(path).decode())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(path, f"is not valid TOML ({' '.join(str(error).split())}); correct it and try again") from None
 
 
 def read_bytes(path: str | Path, limit: int | None = None) -> bytes:

@@ -36,11 +36,13 @@ def checked(motion: npt.ArrayLike, name: str = "motion") -> FloatArray:
     Raises ArrayError if it is no rigid motion within ROTATION_TOLERANCE (mirrored, scaled, sheared, NaN)."""
     matrix = require(name, motion, (4, 4), finite=True)
     rotation = matrix[:3, :3]
-    departure = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
-    if departure > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0 or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-9:
+    with np.errstate(over="ignore", invalid="ignore"):  # numbers that large are refused below
+        departure = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+        determinant = float(np.linalg.det(rotation))
+    if not departure <= ROTATION_TOLERANCE or determinant < 0 or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-9:
         raise ArrayError(
             f"{name} is not a rigid motion: R^T R departs from the identity by {departure:.3g} "
-            f"(allowed {ROTATION_TOLERANCE:g}), determinant {np.linalg.det(rotation):.4g}",
+            f"(allowed {ROTATION_TOLERANCE:g}), determinant {determinant:.4g}",
             name=name,
             departure=departure,
         )

@@ -78,7 +78,7 @@ def read_index(path: str | Path) -> list[dict[str, Any]]:
             row = json.loads(line)
             if not isinstance(row, dict) or not {"index", "picture", "truth"} <= row.keys():
                 raise ValueError("it lacks index, picture or truth")
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             if number == len(lines) - 1:
                 break
             raise InputError(path, f"line {number + 1} is no row of an index ({error})") from None

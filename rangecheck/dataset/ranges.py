@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import difflib
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -16,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from rangecheck.errors import InputError, SettingError
-from rangecheck.files import presets_folder, read_bytes
+from rangecheck.errors import SettingError
+from rangecheck.files import presets_folder, read_toml
 
 Range = tuple[float, float]
 
@@ -125,10 +124,7 @@ def read_ranges(file: str | Path | None = None) -> Ranges:
     path = presets_folder() / "datasets" / "default.toml" if file is None else Path(file)
     if path.suffix != ".toml" and not path.exists():
         path = presets_folder() / "datasets" / f"{file}.toml"
-    try:
-        document = tomllib.loads(read_bytes(path).decode())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(path, f"is not valid TOML ({error}); correct it and try again") from None
+    document = read_toml(path)
     names = ["plaster"]
     found = {f"{part}.{name}": default for part, names_ in _LIMITS.items() for name, (default, _) in names_.items()}
     for part, rows in document.items():
@@ -155,7 +151,7 @@ def _range(value: Any, where: str, limits: Range) -> Range:
     numbers = value if isinstance(value, list) else [value, value]
     if (
         len(numbers) != 2
-        or not all(isinstance(n, (int, float)) and not isinstance(n, bool) and math.isfinite(n) for n in numbers)
+        or not all(isinstance(n, (int, float)) and not isinstance(n, bool) for n in numbers)
         or not low <= numbers[0] <= numbers[1] <= high
     ):
         raise SettingError(f"{where} is {value!r}; it must be [low, high] between {low:g} and {high:g}", key=where.split()[-1])

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import difflib
 import math
-import tomllib
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -28,8 +28,8 @@ import numpy as np
 
 from rangecheck import rigid
 from rangecheck.arrays import FloatArray
-from rangecheck.errors import InputError, SceneError
-from rangecheck.files import read_bytes
+from rangecheck.errors import SceneError
+from rangecheck.files import read_toml
 from rangecheck.modeler import primitives
 from rangecheck.modeler.engine import OPERATIONS, combine, common_volume_mm3
 from rangecheck.modeler.model import Lamp, Model, model_of
@@ -63,11 +63,7 @@ TOUCHING = 1e-6
 def read_model(path: str | Path) -> Model:
     """The scene in a TOML file. Raises InputError (not TOML, unreadable mesh), SceneError (names the body and the rule)."""
     path = Path(path)
-    try:
-        document = tomllib.loads(read_bytes(path).decode())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(path, f"is not valid TOML ({error}); correct it and try again") from None
-    return model_from_dict(document, path.parent)
+    return model_from_dict(read_toml(path), path.parent)
 
 
 def model_from_dict(document: Mapping[str, Any], folder: str | Path | None = None) -> Model:
@@ -314,7 +310,8 @@ def _unique(names: Sequence[str], where: str) -> None:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    # whole numbers beyond every float are numbers to TOML, and nothing that can be drawn
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
 def _positive(value: Any, where: str) -> float:

@@ -80,8 +80,10 @@ class PinholeCamera(Camera):
     @classmethod
     def from_field_of_view(cls, width: int, height: int, horizontal_deg: float) -> PinholeCamera:
         """Square pixels, principal point in the middle, `horizontal_deg` (0 to 180) across the full width."""
-        if not 0 < horizontal_deg < 180:
-            raise CameraError(f"field of view is {horizontal_deg} degrees; it must lie between 0 and 180")
+        if not (0 < horizontal_deg < 180 and max(width, height) < 2**31):
+            raise CameraError(
+                f"field of view is {horizontal_deg} degrees of {width}x{height} pixels; it must lie between 0 and 180, and pixels below 2^31"
+            )
         focal = 0.5 * width / math.tan(math.radians(horizontal_deg) / 2)
         return cls(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
@@ -249,7 +251,7 @@ def camera_from_dict(description: Mapping[str, Any]) -> Camera:
         raise CameraError(f"camera is {type(description).__name__}; it must be an object with a model and its numbers")
     numbers = dict(description)
     model = numbers.pop("model", "pinhole")
-    if model not in _MODELS:
+    if not isinstance(model, str) or model not in _MODELS:
         raise CameraError(f"camera model is {model!r}; known are {', '.join(_MODELS)}", name="model")
     kind = _MODELS[model]
     wanted = {item.name: item for item in fields(kind)}

@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from rangecheck.errors import InputError, OutputError
-from rangecheck.files import read_json, sweep_parts, write_json
+from rangecheck.files import is_part, read_json, sweep_parts, write_json
 
 UNFINISHED = "unfinished.json"
+LOCK = ".lock"
 
 
 def key_of(**content: Any) -> str:
@@ -39,7 +40,8 @@ def check_free(path: str | Path, finished: str, *, force: bool) -> None:
     check_writable(path)
     if path.exists() and not path.is_dir():
         raise OutputError(path, "is a file; the results need a folder")
-    if force or not path.is_dir() or not any(path.iterdir()):
+    # a job that was killed before it could say which it is leaves its lock and a half-written mark, nothing more
+    if force or not path.is_dir() or all(one.name == LOCK or is_part(one) for one in path.iterdir()):
         return
     if (path / finished).exists():
         raise OutputError(path, "holds finished results; pass --force to replace them, or choose another folder")
@@ -73,7 +75,7 @@ def job_folder(path: str | Path, key: str, finished: str, *, force: bool) -> Ite
 def _lock(path: Path) -> Iterator[None]:
     import fcntl
 
-    with (path / ".lock").open("w") as handle:
+    with (path / LOCK).open("w") as handle:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
@@ -81,4 +83,4 @@ def _lock(path: Path) -> Iterator[None]:
         try:
             yield
         finally:
-            (path / ".lock").unlink(missing_ok=True)
+            (path / LOCK).unlink(missing_ok=True)

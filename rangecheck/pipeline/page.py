@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -328,6 +329,17 @@ def _distance_maps(folder: Path) -> list[DistanceMap]:
     return list(found.values())
 
 
+def _drawn(path: Path, study: dict[str, Any]) -> list[tuple[str, str]]:
+    """Slug and title of every chart of a study's document."""
+    try:
+        charts = [(chart["slug"], str(chart["title"])) for chart in study["charts"]]
+    except (TypeError, KeyError) as error:
+        raise InputError(path, f"is no study that `rangecheck study` wrote ({error}); make it again") from None
+    if not all(isinstance(slug, str) and re.fullmatch(r"[\w. -]{1,80}", slug) for slug, _ in charts):
+        raise InputError(path, "a chart's slug must be a plain name; make the study again")
+    return charts
+
+
 def _charts(folder: Path) -> list[Figure]:
     """The charts of the studies in `folder`, titled as their documents title them."""
     if not folder.is_dir():
@@ -337,10 +349,10 @@ def _charts(folder: Path) -> list[Figure]:
         study = read_json(path)
         if not isinstance(study, dict) or study.get("schema") != "rangecheck/study/1":
             continue
-        for chart in study["charts"]:
-            picture = path.with_name(f"{path.stem}-{chart['slug']}.svg")
+        for slug, title in _drawn(path, study):
+            picture = path.with_name(f"{path.stem}-{slug}.svg")
             if picture.is_file():
-                found.append(Figure(chart["title"], study["title"], read_bytes(picture), alt=f"Chart: {chart['title']}"))
+                found.append(Figure(title, str(study.get("title", "")), read_bytes(picture), alt=f"Chart: {title}"))
     if not found:
         raise InputError(folder, "holds no charts; give the folder that `rangecheck study` wrote")
     return found

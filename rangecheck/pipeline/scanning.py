@@ -8,7 +8,8 @@ from pathlib import Path
 from rangecheck.config import Settings
 from rangecheck.errors import OutputError, PosesRefused
 from rangecheck.files import whole_file
-from rangecheck.pipeline.folder import check_free, check_writable
+from rangecheck.pipeline.folder import check_free, check_writable, job_folder, key_of
+from rangecheck.pipeline.health import versions
 from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.preparing import prepared
 from rangecheck.pipeline.subject import hashes, read_all_scans, surface_of
@@ -113,13 +114,17 @@ def simulate(
             made.append(simulate_scan(caster, camera, pose, finder, seed, scan_index=index, name=f"view_{index:02d}"))
             reporter.advance(index + 1)
     step = finder.step_mm or distance * 2 / 65535
-    with reporter.stage("writing"):
-        manifest = write_scans(Path(out), [one.scan for one in made], step_mm=step)
+    key = key_of(
+        inputs=hashes([path]), unit=unit, views=views, size=size, noise_mm=noise_mm, kind=kind, ambient=ambient, seed=seed
+    )
+    with reporter.stage("writing"), job_folder(out, key, "scans.json", force=force) as folder:
         for one in made:
-            with whole_file(Path(out) / "truth" / f"{one.scan.name}.npz") as part, part.open("wb") as stream:
+            with whole_file(folder / "truth" / f"{one.scan.name}.npz") as part, part.open("wb") as stream:
                 np.savez_compressed(
                     stream, true_range_mm=one.true_range_mm, true_normal=one.true_normal, noise_mm=one.noise_mm, reason=one.reason
                 )
+        # last: with its manifest the folder is finished
+        manifest = write_scans(folder, [one.scan for one in made], step_mm=step)
     valid = [int(one.scan.valid.sum()) for one in made]
     lines = [
         f"{manifest}: {views} scans of {size[0]}x{size[1]}, {sum(valid):,} distances, {kind}, noise {noise_mm:g} mm at {distance:.0f} mm",
@@ -138,6 +143,6 @@ def sample(out: str, *, force: bool, reporter: Reporter) -> Outcome:
     from rangecheck.scan.sample import make_sample_data
 
     check_free(out, "scans.json", force=force)
-    with reporter.stage("scanning the sample bust"):
+    with reporter.stage("scanning the sample bust"), job_folder(out, key_of(sample=versions()), "scans.json", force=force):
         manifests = make_sample_data(out)
     return Outcome(document("sample", manifests=manifests, files=hashes([out])), [str(path) for path in manifests])

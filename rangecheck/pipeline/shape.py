@@ -294,7 +294,12 @@ def solid(
         "seconds": reporter.seconds,
         "decisions": reporter.notes,
     }
-    write_json(beside, content, force=force)
+    try:
+        write_json(beside, content, force=force)
+    except OutputError:
+        for one in (out, *plugs):  # a part without its word is not left; nor does it stand in the way of the next try
+            Path(one).unlink(missing_ok=True)
+        raise
     return Outcome(content, [*lines, f"{beside}: what it was made of, and how"], fit)
 
 

@@ -11,7 +11,6 @@ F is Fresnel's share at the facet for metals with known n and k, and 1 otherwise
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -22,7 +21,7 @@ import numpy as np
 
 from rangecheck.arrays import FloatArray
 from rangecheck.errors import InputError, SceneError
-from rangecheck.files import presets_folder, read_bytes
+from rangecheck.files import presets_folder, read_toml
 from rangecheck.reflectance.energy import visibility_table
 from rangecheck.reflectance.fast import lobe_table
 from rangecheck.reflectance.fresnel import fresnel_table
@@ -224,11 +223,7 @@ def load_material(name_or_path: str | Path) -> Material:
                 name_or_path, f"is no shipped material; choose one of {', '.join(shipped)}, or a .toml file", shipped=shipped
             )
         path = presets_folder() / "materials" / f"{name_or_path}.toml"
-    try:
-        document = tomllib.loads(read_bytes(path).decode())
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(path, f"is not valid TOML ({error}); correct it and try again") from None
-    return _material_from(path, document)
+    return _material_from(path, read_toml(path))
 
 
 _NUMBERS = ("K_lm", "K_ss", "K_sl", "K_s")
@@ -250,6 +245,8 @@ _INDEX_KEYS = ("wavelengths_um", "n", "k", "source")
 def _material_from(path: Path, document: dict[str, Any]) -> Material:
     values = dict(document)
     index = values.pop("index", {})
+    if not isinstance(index, dict):
+        raise InputError(path, f"its index is {index!r}; it must be a table with {', '.join(_INDEX_KEYS)}")
     # what a fit says of its own numbers is for people and programs, not for light
     values.pop("uncertainty", None)
     unknown = [key for key in document if key not in _KEYS] + [f"index.{key}" for key in index if key not in _INDEX_KEYS]
@@ -258,13 +255,15 @@ def _material_from(path: Path, document: dict[str, Any]) -> Material:
     for key in (*_NUMBERS, "wavelengths_um"):
         if isinstance(values.get(key), list):
             values[key] = tuple(values[key])
-    sources = [text for text in (values.get("source", ""), index.get("source", "")) if text]
+    sources = [text for text in (values.get("source", ""), index.get("source", "")) if text != ""]
+    if not all(isinstance(text, str) for text in sources):
+        raise InputError(path, f"its source is {sources[0]!r}; it must be text")
     values["source"] = "; ".join(sources)
     try:
         if index:
             values.update(index_um=tuple(index["wavelengths_um"]), n=tuple(index["n"]), k=tuple(index["k"]))
         return Material(name=path.stem, **values)
-    except (TypeError, KeyError) as error:
+    except (TypeError, KeyError, OverflowError) as error:
         raise InputError(path, f"does not describe a material ({error})") from None
     except SceneError as error:
         raise InputError(path, str(error), **error.measured) from None

@@ -64,9 +64,8 @@ def make_sample_data(folder: str | Path) -> list[Path]:
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
         raise OutputError(folder, "is a file; name a folder")
-    manifests = [
-        write_scans(folder, [sample_view(index).scan for index in range(VIEWS)], step_mm=FINDER.step_mm),
-        write_scans(folder / "frontal", [sample_frontal().scan], step_mm=FINDER.step_mm),
-    ]
     write_bytes(folder / "README.md", README.encode())
-    return manifests
+    frontal = write_scans(folder / "frontal", [sample_frontal().scan], step_mm=FINDER.step_mm)
+    # last: with the manifest of the views the folder is finished
+    views = write_scans(folder, [sample_view(index).scan for index in range(VIEWS)], step_mm=FINDER.step_mm)
+    return [views, frontal]

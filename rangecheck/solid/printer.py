@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
 
 from rangecheck.errors import InputError, SettingError
-from rangecheck.files import presets_folder
+from rangecheck.files import presets_folder, read_toml
 
 
 @dataclass(frozen=True)
@@ -49,10 +47,7 @@ def printer(name: str | Path) -> Printer:
         raise SettingError(
             f"no printer is called {str(name)!r}; known are {', '.join(printer_names())}, or give a .toml file", key="printer"
         )
-    try:
-        entries: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(path, f"is not valid TOML ({error}); correct it and try again") from None
+    entries = read_toml(path)
     wanted = {f.name for f in fields(Printer)}
     if set(entries) != wanted:
         odd = sorted(set(entries) ^ wanted)
@@ -68,7 +63,7 @@ def printer(name: str | Path) -> Printer:
             or any(not math.isfinite(x) or x < 0 for x in numbers.values())
         ):
             raise ValueError
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise SettingError(
             f"{path}: its numbers must be positive, build_mm three of them, wall_mm pairs", key="printer"
         ) from None

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 STUDIES = {
     "checking": "rangecheck.studies.checking",
     "fit": "rangecheck.studies.fit",
+    "hardness": "rangecheck.studies.hardness",
     "consistency": "rangecheck.studies.consistency",
     "pictures": "rangecheck.studies.pictures",
     "meshing": "rangecheck.studies.meshing",

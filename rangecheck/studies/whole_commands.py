@@ -38,7 +38,7 @@ def command(*arguments: str) -> Run:
     """`rangecheck ARGUMENTS --json -q`, measured. Raises RangecheckError with its last words when it fails."""
     begin = time.perf_counter()
     with tempfile.TemporaryFile() as said, tempfile.TemporaryFile() as complaint:
-        process = subprocess.Popen(_line(arguments), stdout=said, stderr=complaint)
+        process = subprocess.Popen(command_line(arguments), stdout=said, stderr=complaint)
         _, status, usage = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)
         seconds = time.perf_counter() - begin
@@ -51,18 +51,35 @@ def command(*arguments: str) -> Run:
 
 def killed_at(arguments: Sequence[str], steps: Callable[[], int], at: int) -> int:
     """The command, killed as soon as `steps()` has reached `at`; how many steps it left done. It may end before that."""
-    process = subprocess.Popen(_line(arguments), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    process = subprocess.Popen(command_line(arguments), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     _wait(process, steps, at)
     process.send_signal(signal.SIGKILL)
     process.wait()
     return steps()
 
 
+def killed_after(arguments: Sequence[str], seconds: float) -> bool:
+    """The command, killed after so many seconds; whether it had ended before. Raises RangecheckError when it failed by then."""
+    with tempfile.TemporaryFile() as complaint:
+        process = subprocess.Popen(command_line(arguments), stdout=subprocess.DEVNULL, stderr=complaint)
+        try:
+            status = process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGKILL)
+            status = process.wait()
+        if status not in (0, 1, -signal.SIGKILL):
+            complaint.seek(0)
+            raise _failed(arguments, complaint.read())
+    return status in (0, 1)
+
+
 def on_cluster_of_two(arguments: Sequence[str], steps: Callable[[], int], at: int) -> int:
     """The command on a dask scheduler with two workers of one thread each, all processes of this machine; one worker is killed as
     soon as `steps()` has reached `at`. How many steps were done by then. Raises DependencyMissing, or RangecheckError when it fails."""
     with cluster(2) as (address, workers):
-        process = subprocess.Popen(_line([*arguments, "--scheduler", address]), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+        process = subprocess.Popen(
+            command_line([*arguments, "--scheduler", address]), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+        )
         try:
             _wait(process, steps, at)
             workers[0].kill()
@@ -124,8 +141,9 @@ def _sample_scans(folder: Path) -> Path:
     return folder / "sample"
 
 
-def _line(arguments: Sequence[str]) -> list[str]:
-    return [sys.executable, "-m", "rangecheck_cli", *arguments, "--json", "-q"]
+def command_line(arguments: Sequence[str], *, quiet: bool = True) -> list[str]:
+    """The command as a process is given it; quiet, with its JSON document."""
+    return [sys.executable, "-m", "rangecheck_cli", *arguments, *(("--json", "-q") if quiet else ())]
 
 
 def _wait(process: subprocess.Popen[bytes], steps: Callable[[], int], at: int) -> None:

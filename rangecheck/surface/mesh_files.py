@@ -157,7 +157,14 @@ def _obj(path: Path, content: bytes) -> tuple[FloatArray, IntArray]:
                 faces.extend((ring[0], ring[k], ring[k + 1]) for k in range(1, len(ring) - 1))
         except (ValueError, IndexError):
             raise InputError(path, f"line {number} is not OBJ: {line[:60]!r}; export it again") from None
-    return np.array(vertices, np.float64).reshape(-1, 3), np.array(faces, np.int64).reshape(-1, 3)
+    return np.array(vertices, np.float64).reshape(-1, 3), _numbered(path, faces)
+
+
+def _numbered(path: Path, faces: list[tuple[int, int, int]]) -> IntArray:
+    try:
+        return np.array(faces, np.int64).reshape(-1, 3)
+    except OverflowError:
+        raise InputError(path, "its faces name vertices by numbers beyond 64 bits; export it again") from None
 
 
 def _off(path: Path, content: bytes) -> tuple[FloatArray, IntArray]:
@@ -183,7 +190,7 @@ def _off(path: Path, content: bytes) -> tuple[FloatArray, IntArray]:
             faces.extend((ring[0], ring[k], ring[k + 1]) for k in range(1, len(ring) - 1))
     except (ValueError, IndexError):
         raise InputError(path, "holds lines that are not OFF; export it again") from None
-    return vertices, np.array(faces, np.int64).reshape(-1, 3)
+    return vertices, _numbered(path, faces)
 
 
 def _through_trimesh(path: Path, content: bytes, kind: str) -> tuple[FloatArray, IntArray, str]:
@@ -204,6 +211,8 @@ def _through_trimesh(path: Path, content: bytes, kind: str) -> tuple[FloatArray,
     if mesh is None:
         raise InputError(path, "holds no faces; export it again")
     said = "m" if kind == "glb" else _UNITS_3MF.get(str(scene.units or "millimeter").rstrip("s"), "mm")
+    if len(mesh.faces) and not 0 <= np.min(mesh.faces) <= np.max(mesh.faces) < len(mesh.vertices):
+        raise InputError(path, f"its faces name vertices outside the {len(mesh.vertices)} that it has; export it again")
     # each primitive of GLB brings all vertices of its buffer: keep those that it uses
     used, faces = np.unique(mesh.faces, return_inverse=True)
     return np.asarray(mesh.vertices, np.float64)[used], faces.reshape(-1, 3), said

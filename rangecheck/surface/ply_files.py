@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from rangecheck.arrays import FloatArray, IntArray
 from rangecheck.errors import InputError
@@ -105,8 +106,12 @@ def _header(path: Path, content: bytes) -> tuple[str, list[_Element], bytes]:
         raise InputError(
             path, f"its format is {form or 'not stated'!r}; known are ascii, binary_little_endian, binary_big_endian"
         )
-    if any(e.count < 0 for e in elements):
-        raise InputError(path, "its header counts a negative number of elements; export it again")
+    for e in elements:
+        names = {p.name for p in e.properties}
+        if e.count < 0 or len(names) < max(len(e.properties), 1):
+            raise InputError(
+                path, f"its header gives {e.name} {e.count} elements of {len(names)} different properties; export it again"
+            )
     return form, elements, body
 
 
@@ -156,7 +161,7 @@ class _AsciiBody:
             table = self.numbers[self.at : self.at + 4 * element.count].reshape(-1, 4)
             if (table[:, 0] == 3).all():
                 self.at += 4 * element.count
-                return {element.properties[0].name: _Polygons(table[:, 1:].astype(np.int64).ravel(), np.full(element.count, 3))}
+                return {element.properties[0].name: _Polygons(_whole(self.path, table[:, 1:].ravel()), np.full(element.count, 3))}
         return self._row_by_row(element)
 
     def _row_by_row(self, element: _Element) -> dict[str, Any]:
@@ -167,7 +172,7 @@ class _AsciiBody:
                 self._need(1, element)
                 count = 1
                 if p.count_kind:
-                    count = int(self.numbers[self.at])
+                    count = int(_whole(self.path, self.numbers[self.at : self.at + 1])[0])
                     counts[p.name].append(count)
                     self.at += 1
                     if count < 0:
@@ -175,7 +180,7 @@ class _AsciiBody:
                     self._need(count, element)
                 pieces[p.name].append(self.numbers[self.at : self.at + count])
                 self.at += count
-        return _columns(element, pieces, counts)
+        return _columns(self.path, element, pieces, counts)
 
 
 class _BinaryBody:
@@ -208,7 +213,7 @@ class _BinaryBody:
                 self.at += row.itemsize * element.count
                 three = np.full(element.count, 3)
                 return {
-                    p.name: _Polygons(table[p.name].astype(np.int64).ravel(), three) if p.count_kind else table[p.name]
+                    p.name: _Polygons(_whole(self.path, table[p.name].ravel()), three) if p.count_kind else table[p.name]
                     for p in element.properties
                 }
         return self._row_by_row(element)
@@ -225,7 +230,7 @@ class _BinaryBody:
                 count = 1
                 if count_kind is not None:
                     self._need(count_kind.itemsize, element)
-                    count = int(np.frombuffer(self.body, count_kind, 1, self.at)[0])
+                    count = int(_whole(self.path, np.frombuffer(self.body, count_kind, 1, self.at))[0])
                     counts[p.name].append(count)
                     self.at += count_kind.itemsize
                     if count < 0:
@@ -233,12 +238,19 @@ class _BinaryBody:
                 self._need(count * kind.itemsize, element)
                 pieces[p.name].append(np.frombuffer(self.body, kind, count, self.at))
                 self.at += count * kind.itemsize
-        return _columns(element, pieces, counts)
+        return _columns(self.path, element, pieces, counts)
 
 
-def _columns(element: _Element, pieces: dict[str, list[Any]], counts: dict[str, list[int]]) -> dict[str, Any]:
+def _whole(path: Path, numbers: npt.NDArray[Any]) -> IntArray:
+    """Numbers of vertices, whatever type the file gives them. Raises InputError for what no vertex can have."""
+    if numbers.dtype.kind == "f" and not (np.abs(numbers) < 2**53).all():
+        raise InputError(path, "a face names a vertex by what is no whole number; the file is damaged")
+    return numbers.astype(np.int64)
+
+
+def _columns(path: Path, element: _Element, pieces: dict[str, list[Any]], counts: dict[str, list[int]]) -> dict[str, Any]:
     columns: dict[str, Any] = {}
     for p in element.properties:
         flat = np.concatenate(pieces[p.name]) if pieces[p.name] else np.empty(0)
-        columns[p.name] = _Polygons(flat.astype(np.int64), np.array(counts[p.name], np.int64)) if p.count_kind else flat
+        columns[p.name] = _Polygons(_whole(path, flat), np.array(counts[p.name], np.int64)) if p.count_kind else flat
     return columns
