@@ -6,7 +6,7 @@ from test_maps import ball
 
 from rangecheck import kernels, rigid
 from rangecheck.animation import faces_seen, measure_consistency, orbit_around, outline_of, verdict_for
-from rangecheck.animation.standing_out import departure_in, spots
+from rangecheck.animation.standing_out import Departure, departure_in, pixel_width_mm, spots, threshold_of
 from rangecheck.errors import SurfaceError
 from rangecheck.maps import trace_maps
 from rangecheck.optics import PinholeCamera, Sensor
@@ -134,3 +134,22 @@ def test_a_dent_stands_out_of_its_own_picture_and_a_sound_ball_shows_nothing():
         found.append(spots([departure_in(scene, camera, rigid.look_at((0, 0, 400), (0, 0, 0)), settings, sensor)], 5.0))
     assert found[0] == []
     assert len(found[1]) == 1 and np.linalg.norm(np.subtract(found[1][0].centre_mm, top)) < 3.0
+
+
+def test_of_places_whose_tail_falls_exponentially_as_many_stand_out_as_are_expected():
+    camera = PinholeCamera.from_field_of_view(200, 200, 25)
+    maps = trace_maps(ball(50.0, subdivisions=3), camera, rigid.look_at((0, 0, 451), (0, 0, 0)))
+    side = round(1.0 / pixel_width_mm(maps))
+    rng = np.random.default_rng(0)
+
+    def named(law, count=100):
+        values = [np.repeat(np.repeat(law(rng, (200 // side,) * 2), side, 0), side, 1) for _ in range(count)]
+        seen = [Departure(value, maps) for value in values]
+        return [(v[::side, ::side] > threshold_of([one]).sigmas).sum() for v, one in zip(values, seen)]
+
+    # 100 pictures of 0.05 expected places each are 5, and the threshold itself is told from the few largest values
+    assert 1 <= sum(named(lambda r, shape: r.exponential(size=shape))) <= 25
+    # a normal law's tail falls faster: fewer
+    assert sum(named(lambda r, shape: np.abs(r.normal(size=shape)))) <= 5
+    few = Departure(np.ones((10, 10)), maps)
+    assert threshold_of([few]).sigmas == np.inf and threshold_of([]).places == 0

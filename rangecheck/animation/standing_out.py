@@ -30,6 +30,10 @@ SPOT_MM, RING_MM = 0.5, (4.0, 8.0)
 LEAST_COSINE = float(np.cos(np.radians(65.0)))
 #: a ring counts where this share of it is on the surface
 WHOLE = 0.9
+#: places that stand out by chance, expected in all pictures of a sound surface together
+FALSE_PLACES = 0.05
+#: share of the places that the tail is told from, and the fewest of them that tell it
+TAIL, FEWEST = 0.01, 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,15 +84,30 @@ def normals_around(surface: Surface, length_mm: float = SMOOTH_MM) -> FloatArray
 def departure_in(
     scene: Scene, camera: PinholeCamera, world_from_camera: FloatArray, settings: Settings, sensor: Sensor, *, seed: int = 0
 ) -> Departure:
-    """The scene of one wavelength pictured by `sensor`, exposed so that hardly anything saturates, and held against what the normals
-    around lead to expect."""
-    surface = scene.surface
-    around = normals_around(surface)
-    tracer = Tracer(scene)
-    maps = trace_maps(surface, camera, world_from_camera, tracer.caster, allow_inside=True)
+    """`departures_in` of one picture."""
+    return departures_in(scene, camera, [world_from_camera], settings, sensor, seed=seed)[0]
+
+
+def departures_in(
+    scene: Scene, camera: PinholeCamera, poses: Sequence[FloatArray], settings: Settings, sensor: Sensor, *, seed: int = 0
+) -> list[Departure]:
+    """The scene of one wavelength pictured from each pose by `sensor`, exposed so that hardly anything saturates, and held against what
+    the normals around lead to expect."""
+    tracers = Tracer(scene), Tracer(replace(scene, vertex_normals=normals_around(scene.surface)))
+    return [_departure(tracers, camera, pose, settings, sensor, seed + k) for k, pose in enumerate(poses)]
+
+
+def _departure(
+    tracers: tuple[Tracer, Tracer],
+    camera: PinholeCamera,
+    world_from_camera: FloatArray,
+    settings: Settings,
+    sensor: Sensor,
+    seed: int,
+) -> Departure:
+    maps = trace_maps(tracers[0].scene.surface, camera, world_from_camera, tracers[0].caster, allow_inside=True)
     seen, expected = (
-        one.render(camera, world_from_camera, settings, seed=seed).radiance[..., 0].astype(np.float64)
-        for one in (tracer, Tracer(replace(scene, vertex_normals=around)))
+        one.render(camera, world_from_camera, settings, seed=seed).radiance[..., 0].astype(np.float64) for one in tracers
     )
     white = float(np.quantile(seen[maps.hit], 0.98)) if maps.hit.any() else 1.0
     level = 0.8 / white if white > 0 else 1.0
@@ -111,7 +130,7 @@ def departure_of(seen: FloatArray, expected: FloatArray, noise: FloatArray, maps
     import cv2
 
     hit = maps.hit & (np.cos(np.nan_to_num(maps.incidence_rad, nan=3.0)) > LEAST_COSINE)
-    pixel_mm = _pixel_mm(maps)
+    pixel_mm = pixel_width_mm(maps)
 
     def spread(values: FloatArray, length_mm: float) -> FloatArray:
         return np.asarray(cv2.GaussianBlur(values, (0, 0), max(length_mm / pixel_mm, 0.3), borderType=cv2.BORDER_CONSTANT))
@@ -145,10 +164,48 @@ def _ring(values: FloatArray, pixel_mm: float) -> FloatArray:
     return np.asarray(cv2.filter2D(values, -1, kernel / kernel.sum(), borderType=cv2.BORDER_CONSTANT))
 
 
-def _pixel_mm(maps: Maps) -> float:
+def pixel_width_mm(maps: Maps) -> float:
     """Width of a pixel at the median depth."""
     assert isinstance(maps.camera, PinholeCamera)
     return float(np.nanmedian(maps.depth_mm)) / maps.camera.fx if maps.hit.any() else 1.0
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """sigmas: a place stands out from here on; places: how many were judged in all pictures."""
+
+    sigmas: float
+    places: int
+
+
+def threshold_of(departures: Sequence[Departure], expected: float = FALSE_PLACES) -> Threshold:
+    """From how many sigmas on a place stands out, told from the surface's own places, so that on a surface without defects `expected`
+    places do in all pictures together; infinite where there are too few places to tell.
+
+    A place is a square of two SPOT_MM and counts by its highest value, as neighbouring pixels say the same. Folds and edges of the shape
+    make the places' tail heavier than a normal law's: its slope is measured, from the share 2 TAIL of the places to the share TAIL, and
+    continued exponentially to `expected` places of all. Quantiles do not see how far the few places beyond them lie, so a defect
+    does not hide itself while it covers less than TAIL of what is judged. A tail that falls more slowly still than exponentially names
+    places in excess of `expected`. Never below what the normal law asks for as many places."""
+    from scipy.stats import norm
+
+    found = [_places(one) for one in departures]
+    values = np.concatenate([np.empty(0), *found])
+    if len(values) * TAIL < FEWEST:
+        return Threshold(np.inf, len(values))
+    outer, inner = (float(q) for q in np.quantile(values, (1 - TAIL, 1 - 2 * TAIL)))
+    share = min(expected / len(values), TAIL)
+    reached = outer + (outer - inner) * np.log2(TAIL / share)
+    return Threshold(max(float(reached), float(norm.isf(share / 2))), len(values))
+
+
+def _places(one: Departure) -> FloatArray:
+    """The highest value of each place that is judged."""
+    side = max(1, round(2 * SPOT_MM / pixel_width_mm(one.maps)))
+    h, w = (length // side for length in one.sigmas.shape)
+    cells = np.nan_to_num(one.sigmas[: h * side, : w * side], nan=-1.0).reshape(h, side, w, side).max(axis=(1, 3))
+    judged: FloatArray = cells[cells >= 0]
+    return judged
 
 
 def spots(departures: Sequence[Departure], threshold: float, apart_mm: float = RING_MM[0]) -> list[Spot]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,17 +21,29 @@ from rangecheck.animation import (
     verdict_for,
 )
 from rangecheck.animation.consistency import Outline
+from rangecheck.animation.standing_out import (
+    FALSE_PLACES,
+    SPOT_MM,
+    Spot,
+    Threshold,
+    departures_in,
+    pixel_width_mm,
+    spots,
+    threshold_of,
+)
 from rangecheck.config import Settings
 from rangecheck.export.mapped import coloured_map
 from rangecheck.export.pictures import write_png
 from rangecheck.files import write_json
 from rangecheck.maps import Maps, trace_maps
-from rangecheck.optics import PinholeCamera
+from rangecheck.optics import PinholeCamera, Sensor
 from rangecheck.pipeline.outcome import document
 from rangecheck.raycast import EmbreeCaster
 from rangecheck.scan import RangeScan
+from rangecheck.scene import Scene
 from rangecheck.solid.printer import Printer, printer
 from rangecheck.surface import Surface
+from rangecheck.transport import Settings as LightSettings
 
 #: views of the orbit from which it is told what was seen, and pixels across each
 VIEWS, VIEW_PX = 8, 320
@@ -39,6 +51,10 @@ VIEWS, VIEW_PX = 8, 320
 JUDGED = 40_000
 #: flagged places that are named
 NAMED = 10
+#: poses of the turntable, and rays through each pixel, from which places that stand out in mirrored light are looked for
+STANDING_VIEWS, STANDING_RAYS = 6, 4
+#: by a sensor of 8 bits, where the settings have none
+PLAIN_SENSOR = Sensor(full_well=20_000.0, read_noise=10.0, response="srgb")
 #: without a printer in the settings
 PRINTER = "prusa-sl1s"
 
@@ -53,7 +69,9 @@ class Known:
     drawn: list[npt.NDArray[np.uint8]]
 
 
-def known_of(surface: Surface, scans: Sequence[RangeScan], orbit: Orbit, settings: Settings) -> Known:
+def known_of(
+    surface: Surface, scans: Sequence[RangeScan], orbit: Orbit, settings: Settings, standing: Standing | None = None
+) -> Known:
     """Everything of `judge` that needs no frames."""
     camera = PinholeCamera.from_field_of_view(VIEW_PX, VIEW_PX, settings.picture.field_of_view_deg)
     caster = EmbreeCaster(surface.vertices, surface.faces)
@@ -64,17 +82,64 @@ def known_of(surface: Surface, scans: Sequence[RangeScan], orbit: Orbit, setting
     seen = _near_seen(surface, faces_seen(views, len(surface.faces)))
     found = measure_consistency(surface, seen, most=JUDGED)
     outlines = {scan.name: outline_of(surface, scan, caster) for scan in scans}
-    return Known(found, outlines, len(views), _drawn(surface, found, views))
+    return Known(found, outlines, len(views), _drawn(surface, found, views, () if standing is None else standing.spots))
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Places where mirrored light departs from what the normals around lead to expect, and from how many sigmas on they are named."""
+
+    spots: tuple[Spot, ...]
+    threshold: Threshold
+    views: int
+    pixel_mm: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready."""
+        return {
+            "places": [vars(spot) for spot in self.spots[:NAMED]], "flagged": len(self.spots), "threshold_sigmas": self.threshold.sigmas,
+            "places_judged": self.threshold.places, "false_places_expected": FALSE_PLACES, "views": self.views, "pixel_mm": self.pixel_mm,
+        }  # fmt: skip
+
+    def lines(self) -> list[str]:
+        """For people."""
+        if not np.isfinite(self.threshold.sigmas):
+            return [
+                f"places that stand out of what they mirror: not told; pixels of {self.pixel_mm:.2g} mm leave {self.threshold.places} places to "
+                "compare (larger --size shows more)"
+            ]
+        said = [
+            f"in mirrored light {len(self.spots)} of {self.threshold.places:,} places stand out by more than {self.threshold.sigmas:.1f} sigmas, where "
+            f"{FALSE_PLACES:g} are expected of a surface whose places' tail goes on as it begins"
+        ]
+        for spot in self.spots[:3]:
+            x, y, z = spot.centre_mm
+            said.append(f"  stands out of its surroundings at ({x:.1f}, {y:.1f}, {z:.1f}) mm by {spot.sigmas:.1f} sigmas")
+        return said
+
+
+def standing_of(scene: Scene, camera: PinholeCamera, orbit: Orbit, sensor: Sensor | None, seed: int) -> Standing:
+    """What stands out of its own surroundings in a turntable's mirrored light, from STANDING_VIEWS of its own poses."""
+    straight = replace(camera, distortion=())
+    chosen = sorted({k * orbit.frames // STANDING_VIEWS for k in range(STANDING_VIEWS)})
+    followed = LightSettings(passes=1, each=STANDING_RAYS, diffuse=False, depth=1, backdrop=False)
+    poses = [orbit.world_from_camera(k) for k in chosen]
+    found = departures_in(scene.grey(), straight, poses, followed, sensor or PLAIN_SENSOR, seed=seed)
+    pixel = float(np.median([pixel_width_mm(one.maps) for one in found]))
+    threshold = threshold_of(found if pixel <= 2 * SPOT_MM else [])
+    named = spots(found, threshold.sigmas) if np.isfinite(threshold.sigmas) else []
+    return Standing(tuple(named), threshold, len(found), pixel)
 
 
 def judge(
     surface: Surface, scans: Sequence[RangeScan], orbit: Orbit, settings: Settings, frames: Iterable[npt.NDArray[np.uint8]] = (),
-    known: Known | None = None,
+    known: Known | None = None, standing: Standing | None = None,
 ) -> tuple[dict[str, Any], list[str], list[npt.NDArray[np.uint8]]]:  # fmt: skip
     """JSON-ready numbers, lines for people, and pictures of the flagged places from the sides that show most of them.
 
-    `frames` are pictures of the turntable in a material that mirrors; `known` saves measuring what needs none."""
-    known = known or known_of(surface, scans, orbit, settings)
+    `frames` are pictures of the turntable in a material that mirrors; `known` saves measuring what needs none; `standing` is what stands
+    out in mirrored light: it takes pictures of its own, which the whole job does not make."""
+    known = known or known_of(surface, scans, orbit, settings, standing)
     speckle = speckle_of(frames)
     machine = printer(settings.solid.printer or PRINTER)
     height = float(np.ptp(surface.bounds_mm[:, 1]))
@@ -82,8 +147,10 @@ def judge(
     said = verdict_for(known.found, height, wanted, machine.layer_mm, machine.pixel_mm)
     content = _content(known.found, speckle, known.outlines, machine) | {
         "height_mm": wanted, "fit": said.fit, "verdict": said.sentence, "views": known.views,
+        "standing_out": None if standing is None else standing.to_dict(),
     }  # fmt: skip
-    return content, _lines(known.found, speckle, known.outlines, said.sentence), known.drawn
+    lines = _lines(known.found, speckle, known.outlines, said.sentence) + ([] if standing is None else standing.lines())
+    return content, lines, known.drawn
 
 
 def _near_seen(surface: Surface, seen: Any) -> Any:
@@ -131,8 +198,9 @@ def _lines(found: Consistency, speckle: Speckle | None, outlines: dict[str, Any]
     return lines
 
 
-def _drawn(surface: Surface, found: Consistency, views: Sequence[Maps]) -> list[npt.NDArray[np.uint8]]:
-    """Slope residuals in colour from the first view and the one opposite, flagged places ringed."""
+def _drawn(surface: Surface, found: Consistency, views: Sequence[Maps], standing: Sequence[Spot]) -> list[npt.NDArray[np.uint8]]:
+    """Slope residuals in colour from the first view and the one opposite, flagged places ringed: blue by their slopes, green by what
+    they mirror."""
     import cv2
     from scipy.spatial import cKDTree
 
@@ -149,15 +217,17 @@ def _drawn(surface: Surface, found: Consistency, views: Sequence[Maps]) -> list[
         )
         shown = np.array(picture)
         top = shown.shape[0] - VIEW_PX
-        for place in found.places[:NAMED]:
-            uv, depth = maps.camera.project(_moved(maps, np.array([place.centre_mm])))
+        rings = [(place.centre_mm, place.size_mm, 7, (0, 160, 255)) for place in found.places[:NAMED]]
+        rings += [(spot.centre_mm, 2 * SPOT_MM, 10, (40, 220, 90)) for spot in standing[:NAMED]]
+        for centre_mm, size_mm, radius, colour in rings:
+            uv, depth = maps.camera.project(_moved(maps, np.array([centre_mm])))
             column, row = (round(float(c)) for c in np.nan_to_num(uv[0], nan=-1))
             if not (0 <= column < VIEW_PX and 0 <= row < VIEW_PX):
                 continue
-            if not float(depth[0]) <= np.nan_to_num(maps.distance_mm[row, column]) + place.size_mm:
+            if not float(depth[0]) <= np.nan_to_num(maps.distance_mm[row, column]) + size_mm:
                 continue
             left, head = _origin(shown, top)
-            cv2.circle(shown, (left + column, head + row), 7, (0, 160, 255), 2, cv2.LINE_AA)
+            cv2.circle(shown, (left + column, head + row), radius, colour, 2, cv2.LINE_AA)
         pictures.append(shown)
     return pictures
 

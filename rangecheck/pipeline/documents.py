@@ -124,6 +124,10 @@ def _consistency(speckle: Shape, outline: Shape, place: Shape) -> dict[str, Shap
         "slope_noise_deg": NUMBER, "slope_rms_deg": NUMBER, "highlight_jump_deg": NUMBER, "height_noise_mm": NUMBER, "facets_judged": COUNT,
         "speckle": or_null(speckle), "outlines": by_name(outline), "places": many(place), "places_flagged": COUNT, "printer": TEXT,
         "height_mm": NUMBER, "fit": FLAG, "verdict": TEXT, "views": COUNT,
+        "standing_out": or_null(record(
+            places=many(record(centre_mm=POINT, sigmas=NUMBER)), flagged=COUNT, threshold_sigmas=NUMBER, places_judged=COUNT,
+            false_places_expected=NUMBER, views=COUNT, pixel_mm=NUMBER,
+        )),
     }  # fmt: skip
 
 

@@ -26,7 +26,7 @@ from rangecheck.export.video import FORMATS, find_encoder, write_film
 from rangecheck.files import read_json
 from rangecheck.maps import trace_maps
 from rangecheck.pipeline.camera import Optics, camera_of, developed, image_of, optics_of, take
-from rangecheck.pipeline.consistency import judge, write_consistency
+from rangecheck.pipeline.consistency import judge, standing_of, write_consistency
 from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.pictures import plan_of, scene_of
 from rangecheck.pipeline.subject import Subject, read_subject
@@ -338,7 +338,10 @@ def turntable(
         with reporter.stage("consistency"):
             mirrored = next((m for m in made if m.job.plan is not None and any(map(_mirrors, m.job.scene.materials))), None)
             shown = () if mirrored is None else mirrored.pictures()
-            judged, said, pictures = judge(subject.surface, subject.scans, orbit, settings, shown)
+            standing = None
+            if mirrored is not None:
+                standing = standing_of(mirrored.job.scene, camera_of(settings), orbit, mirrored.job.optics.sensor, settings.seed)
+            judged, said, pictures = judge(subject.surface, subject.scans, orbit, settings, shown, standing=standing)
             write_consistency(folder, judged, pictures)
         lines += said
     return Outcome(

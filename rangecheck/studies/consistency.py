@@ -2,7 +2,8 @@
 
 The dent is a Gaussian hollow in the cheek of the sample bust, its depth the knob. It is looked for in a frame of the dented bust's own
 animation, as `animation.standing_out` says: where the picture departs from what the normals around lead to expect by so many times what it
-departs by all around. The same is asked of the sound bust, where nothing may be found. The camera has a sensor of 8 bits whose white
+departs by all around, and by more than the tail of that very picture's places leads to expect. The same is asked of the sound bust and of
+its other cheek, where nothing may be found. The camera has a sensor of 8 bits whose white
 pixel holds 20 000 electrons.
 """
 
@@ -15,7 +16,7 @@ import numpy as np
 
 from rangecheck.analytic.bust import bust_first_hit
 from rangecheck.animation import measure_consistency
-from rangecheck.animation.standing_out import Departure, departure_in, spots
+from rangecheck.animation.standing_out import Departure, departure_in, spots, threshold_of
 from rangecheck.optics import PinholeCamera, Sensor
 from rangecheck.reflectance import load_material
 from rangecheck.rigid import look_at
@@ -35,8 +36,6 @@ AWAY_MM = 600.0
 DENT_MM = 1.0
 #: the dent that must be found in steel, the deepest and the shallowest that are tried
 WANTED_MM, DEEPEST_MM, LEAST_MM = 0.1, 0.2, 5e-3
-#: what counts as standing out: more than any nostril, lip or fold of the sound bust does
-SIGMAS = 15.0
 SENSOR = Sensor(full_well=20_000.0, read_noise=10.0, response="srgb")
 _BRIDGE = 6.0
 
@@ -126,12 +125,14 @@ class _Looks:
         scene = studio(surface, self._material, self._light, front=_TOWARDS, smooth=True)
         return departure_in(scene.grey(), self._camera, self._pose, self._settings, SENSOR, seed=1)
 
-    def stands_out(self, depth_mm: float) -> tuple[float, int]:
-        """By how many sigmas a dent stands out at its place, and how many other places pass for one."""
-        found = spots([self.departure(dented(self._surface, depth_mm))], 1.0)
+    def stands_out(self, depth_mm: float) -> tuple[float, float, int]:
+        """By how many sigmas a dent stands out at its place, how many its picture asks for, and how many other places have them."""
+        seen = self.departure(dented(self._surface, depth_mm))
+        needed = threshold_of([seen]).sigmas
+        found = spots([seen], 1.0)
         near = [np.linalg.norm(np.subtract(spot.centre_mm, CHEEK_MM)) <= 3 * DENT_MM for spot in found]
         at = max((spot.sigmas for spot, here in zip(found, near) if here), default=0.0)
-        return at, sum(spot.sigmas > SIGMAS and not here for spot, here in zip(found, near))
+        return at, needed, sum(spot.sigmas > needed and not here for spot, here in zip(found, near))
 
 
 def _dent_part(quick: bool) -> Part:
@@ -141,32 +142,35 @@ def _dent_part(quick: bool) -> Part:
     for material, light in (("plaster", "dark"), ("steel", "stripes")):
         look = _Looks(material, light, surface, pixels)
         sound = look.departure(surface)
-        false = len(spots([sound], SIGMAS))
+        threshold = threshold_of([sound]).sigmas
+        false = len(spots([sound], threshold))
         highest = float(np.nanmax(sound.sigmas, initial=0.0))
-        at, elsewhere = look.stands_out(WANTED_MM)
+        at, needed, elsewhere = look.stands_out(WANTED_MM)
 
         def hidden(depth: float, look: _Looks = look) -> float:
-            return SIGMAS / max(look.stands_out(depth)[0], 1.0)
+            height, asked, _ = look.stands_out(depth)
+            return asked / max(height, 1.0)
 
         shown = "steel in stripes" if light == "stripes" else "plaster"
         edge = find_edge(shown, hidden, DEEPEST_MM, LEAST_MM, 1.0, logarithmic=True, samples=samples, tolerance=0.2)
         edges.append(edge)
         rows.append(
             {
-                "material": material, "light": light, "sigmas_at_0.1_mm": at, "elsewhere_at_0.1_mm": elsewhere, "false_on_the_sound": false,
+                "material": material, "light": light, "sigmas_at_0.1_mm": at, "threshold_at_0.1_mm": needed, "threshold_on_the_sound": threshold, "elsewhere_at_0.1_mm": elsewhere, "false_on_the_sound": false,
                 "highest_on_the_sound": highest, "found_at_mm": edge.holds_at, "lost_at_mm": edge.breaks_at,
                 "judged_share": float(np.isfinite(sound.sigmas).sum() / sound.maps.hit.sum()),
             }
         )  # fmt: skip
         least = "not at any depth tried" if edge.holds_at is None else f"down to {1000 * edge.holds_at:.2g} µm"
         findings.append(
-            f"{shown}: a dent of {WANTED_MM:g} mm stands out of its own surroundings by {at:.1f} sigmas ({'found' if at >= SIGMAS else 'NOT found'} at "
-            f"{SIGMAS:g}, with {elsewhere} places elsewhere); on the sound bust {false} places do, the highest of all by {highest:.1f}; found {least}; "
+            f"{shown}: a dent of {WANTED_MM:g} mm stands out of its own surroundings by {at:.1f} sigmas ({'found' if at >= needed else 'NOT found'}: "
+            f"its own picture asks for {needed:.1f}, with {elsewhere} places elsewhere); on the sound bust {false} places pass its {threshold:.1f}, the highest of all has "
+            f"{highest:.1f}; found {least}; "
             f"{rows[-1]['judged_share']:.0%} of the surface in the picture is judged"
         )
     chart = EdgeChart(
         "dent", f"A dent of {2 * DENT_MM:g} mm across in the cheek, found without a picture of the sound one", "depth of the dent, mm",
-        f"{SIGMAS:g} sigmas over those it stands out by", edges,
+        "sigmas that its picture asks for over those it stands out by", edges,
     )  # fmt: skip
     return Part([chart], findings, {"dents": rows})
 
