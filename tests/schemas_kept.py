@@ -23,6 +23,9 @@ def complaint(document, name=None):
     if name not in validators():
         return f"there is no schema {name!r}"
     error = best_match(validators()[name].iter_errors(document))
+    while error is not None and error.context:  # of several forms, the one that is missed by least
+        by_form = [[e for e in error.context if e.schema_path[0] == form] for form in {e.schema_path[0] for e in error.context}]
+        error = min(by_form, key=len)[0]
     return error and f"{name} at {'/'.join(map(str, error.absolute_path)) or 'its top'}: {error.message[:300]}"
 
 

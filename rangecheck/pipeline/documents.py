@@ -124,10 +124,10 @@ def _consistency(speckle: Shape, outline: Shape, place: Shape) -> dict[str, Shap
         "slope_noise_deg": NUMBER, "slope_rms_deg": NUMBER, "highlight_jump_deg": NUMBER, "height_noise_mm": NUMBER, "facets_judged": COUNT,
         "speckle": or_null(speckle), "outlines": by_name(outline), "places": many(place), "places_flagged": COUNT, "printer": TEXT,
         "height_mm": NUMBER, "fit": FLAG, "verdict": TEXT, "views": COUNT,
-        "standing_out": or_null(record(
+        "standing_out": maybe(or_null(record(
             places=many(record(centre_mm=POINT, sigmas=NUMBER)), flagged=COUNT, threshold_sigmas=NUMBER, places_judged=COUNT,
             false_places_expected=NUMBER, views=COUNT, pixel_mm=NUMBER,
-        )),
+        ))),
     }  # fmt: skip
 
 
@@ -174,7 +174,7 @@ def _documents() -> dict[str, tuple[Any, ...]]:
         "run": (
             "run.json and `run --json`: a finished job, or the refusal of scans that do not belong together",
             record(
-                fit=FLAG, verdict=ref("verdict"), method=TEXT, reason=TEXT, area_shares=shares, scans=many(ref("scan")),
+                fit=FLAG, verdicts=many(record(about=TEXT, word=TEXT, why=TEXT)), verdict=ref("verdict"), method=TEXT, reason=TEXT, area_shares=shares, scans=many(ref("scan")),
                 stl=or_null(record(file=TEXT, faces=COUNT, moved_by_rounding_mm=NUMBER, standing=or_null(ref("standing")), verdict=ref("verdict"))),
                 quality=or_null(ref("quality")), **placed, faces=COUNT, decisions=TEXTS, front_deg=NUMBER, consistency=ref("consistency"),
                 turntables=many(record(material=TEXT, film=TEXT, frames=COUNT, plan=TEXTS)), inputs=NAMES, settings=ref("settings"),
