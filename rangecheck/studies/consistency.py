@@ -2,8 +2,8 @@
 
 The dent is a Gaussian hollow in the cheek of the sample bust, its depth the knob. It is looked for in a frame of the dented bust's own
 animation, as `animation.standing_out` says: where the picture departs from what the normals around lead to expect by so many times what it
-departs by all around, and by more than the tail of that very picture's places leads to expect. The same is asked of the sound bust and of
-its other cheek, where nothing may be found. The camera has a sensor of 8 bits whose white
+departs by all around, and by more than the tail of that very picture's places leads to expect. The same is asked of the sound bust,
+where nothing may be found. The camera has a sensor of 8 bits whose white
 pixel holds 20 000 electrons.
 """
 
