@@ -54,18 +54,18 @@ class _Remembered:
         self.skin_mm = caster.skin_mm
 
     def closest(self, origins_mm: FloatArray, directions: FloatArray) -> Hits:
-        return self._once(self._caster.closest, origins_mm, directions)  # type: ignore[no-any-return]
+        return self._once(self._caster.closest, origins_mm, directions)
 
     def occluded(self, origins_mm: FloatArray, directions: FloatArray, reach_mm: FloatArray | float = np.inf) -> BoolArray:
-        return self._once(self._caster.occluded, origins_mm, directions, np.asarray(reach_mm))  # type: ignore[no-any-return]
+        return self._once(self._caster.occluded, origins_mm, directions, np.asarray(reach_mm))
 
     def normals(self, points_mm: FloatArray) -> FloatArray:
-        return self._once(self._caster.normals, points_mm)  # type: ignore[no-any-return]
+        return self._once(self._caster.normals, points_mm)
 
     def _once(self, ask: Callable[..., Any], *arrays: FloatArray) -> Any:
         from hashlib import blake2b
 
-        key = (ask.__name__, *(blake2b(np.ascontiguousarray(a), digest_size=16).digest() for a in arrays))
+        key = (ask.__name__, *(blake2b(a.tobytes(), digest_size=16).digest() for a in arrays))
         found = self._known.get(key)
         if found is None:
             found = ask(*arrays)
