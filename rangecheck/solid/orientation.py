@@ -50,7 +50,7 @@ class Orientation:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready."""
-        return asdict(self)
+        return asdict(self) | {"up": list(self.up)}
 
 
 def advise(surface: Surface, printer: Printer, *, up: npt.ArrayLike = UP, step_mm: float | None = None) -> list[Orientation]:
