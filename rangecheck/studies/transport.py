@@ -21,7 +21,7 @@ from rangecheck.studies.scenes import RADIUS_MM, ball, scene_named, view
 from rangecheck.study import Line, LineChart, Part, study_of_parts
 from rangecheck.transport import Film, Settings, Tracer, make_plan, render
 from rangecheck.transport.even import render_evenly
-from rangecheck.transport.plan import full_settings
+from rangecheck.transport.settings import FULL
 
 #: scenes that the plan is tried on, and the pixels along a side of their pictures: where light is reflected many times, path tracing to
 #: half a percent takes so long that the pictures are small
@@ -203,7 +203,7 @@ def _planner(quick: bool) -> Part:
     for name in scenes:
         tracer = Tracer(scene_named(name))
         camera, pose = view(12 if quick else SCENES[name])
-        settings = full_settings(tracer)
+        settings = FULL
         full_s, one = _timed(partial(render_evenly, tracer, camera, pose, settings, tolerance, seed=101))
         other = render_evenly(tracer, camera, pose, settings, _COARSER * tolerance, seed=202)
         plan_s, plan = _timed(partial(make_plan, tracer, camera, pose, tolerance=tolerance, seed=7))

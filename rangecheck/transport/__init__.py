@@ -2,8 +2,8 @@
 
 from rangecheck.transport.adaptive import render_to
 from rangecheck.transport.film import Film, image_irradiance
-from rangecheck.transport.plan import MODELS, TOLERANCE, Plan, make_plan, render
-from rangecheck.transport.settings import DIRECT, REPORT, Settings
+from rangecheck.transport.plan import MODELS, TOLERANCE, make_plan, render
+from rangecheck.transport.settings import DIRECT, REPORT, Plan, Settings
 from rangecheck.transport.tracer import Tracer
 
 __all__ = [

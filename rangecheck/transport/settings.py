@@ -1,8 +1,8 @@
-"""What a picture is computed with. `plan` chooses these; `REPORT` has the 1991 report's own approximations."""
+"""What a picture is computed with. `planner` chooses these; `FULL` is the reference, `REPORT` has the 1991 report's own approximations."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from rangecheck.errors import SettingError
 
@@ -90,3 +90,29 @@ class Settings:
 
 DIRECT = Settings(passes=1, centre=True, shadow_rays=0, spike=False, lobe=False, diffuse=False, depth=1)
 REPORT = Settings(centre=True, shadow_rays=0, diffuse=False, depth=2, glints="corners", gather="fan", lobe_rays=6)
+#: everything that light does: the reference
+FULL = Settings(shadow_rays=1, depth=64, each=4)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a picture will be computed with, and why.
+
+    settings  the light that is followed
+    error     what the noise of the picture may be, relative to its mean radiance; None: settings.passes says how many samples
+    grey      computed at one wavelength, and given to all
+    forms     of the lobe, material by material: fast, or the cheaper smooth or rough; empty: all fast
+    reasons   one line per decision
+    """
+
+    model: str
+    tolerance: float
+    settings: Settings
+    error: float | None
+    grey: bool = False
+    forms: tuple[str, ...] = ()
+    reasons: tuple[str, ...] = field(default=(), repr=False)
+
+    def explain(self) -> list[str]:
+        """The decisions, one line each, for people."""
+        return [f"model {self.model}, tolerance {100 * self.tolerance:g} % of the mean radiance", *self.reasons]
