@@ -266,7 +266,7 @@ def _documents() -> dict[str, tuple[Any, ...]]:
         "lights": (
             "`fit --calibrate`",
             record(kind=one_of("chrome", "matt"), directions=many(POINT), inputs=NAMES, gains=maybe(many(NUMBER)), slope=maybe(NUMBER),
-                   rms=maybe(NUMBER)),
+                   paint=maybe(NUMBER), rms=maybe(NUMBER)),
         ),
         "explained": (
             "`fit` of a scan to its own brightness",

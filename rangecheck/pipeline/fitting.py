@@ -160,7 +160,8 @@ def _model_sight(
 def _calibrated(
     pictures: Sequence[str], values: list[FloatArray], sphere: tuple[float, float, float], kind: str, out: str | None, force: bool
 ) -> Outcome:
-    from rangecheck.recover.spheres import Outline, light_from_chrome, lights_from_matt
+    from rangecheck.recover.matt import lights_from_matt
+    from rangecheck.recover.spheres import Outline, light_from_chrome
 
     outline = Outline((sphere[0], sphere[1]), sphere[2])
     more: dict[str, Any] = {}
@@ -170,9 +171,10 @@ def _calibrated(
     else:
         found = lights_from_matt(values, outline)
         directions = found.directions
-        more = {"gains": found.gains, "slope": found.slope, "rms": found.rms}
+        more = {"gains": found.gains, "slope": found.slope, "paint": found.spread, "rms": found.rms}
         lines.append(
-            f"one matt surface of slope {math.degrees(math.atan(found.slope)):.1f} degrees, residual {found.rms:.2%} of full scale"
+            f"one matt surface of slope {math.degrees(math.atan(found.slope)):.1f} degrees, its albedo varying by {found.spread:.1%} from pixel to pixel; "
+            f"residual {found.rms:.2%} of full scale"
         )
     text = "".join(f"{' '.join(f'{v:.6f}' for v in d)}\n" for d in directions)
     if out is not None:
