@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
+from threading import local
 from typing import Any, TypeVar
 
 import numba
@@ -125,6 +126,7 @@ stage_kernel = _compiled(_nrt=False)
 pasted_kernel = _compiled(_nrt=False, forceinline=True)
 
 _threads = 0
+_here = local()
 
 
 class _FirstCompile(event.Listener):
@@ -143,7 +145,9 @@ event.register("numba:compile", _FirstCompile())
 
 
 def thread_count() -> int:
-    """Threads that `in_chunks` uses: what `set_threads` said, else the cores this process may run on."""
+    """Threads that `in_chunks` uses: what `set_threads` said, else the cores this process may run on; one where work goes `alone`."""
+    if getattr(_here, "alone", False):
+        return 1
     return _threads or len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else _threads or os.cpu_count() or 1
 
 
@@ -162,6 +166,17 @@ def threads(count: int) -> Iterator[None]:
         yield
     finally:
         set_threads(before)
+
+
+@contextmanager
+def alone() -> Iterator[None]:
+    """Within this block, and of this thread only, use one thread: others do other such work beside it."""
+    before = getattr(_here, "alone", False)
+    _here.alone = True
+    try:
+        yield
+    finally:
+        _here.alone = before
 
 
 def in_chunks(work: Callable[[int, int], T], n: int, chunk: int) -> list[T]:

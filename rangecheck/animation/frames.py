@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
@@ -21,6 +22,7 @@ import numpy as np
 from rangecheck.arrays import FloatArray
 from rangecheck.errors import InputError, OutputError
 from rangecheck.files import read_json, sha256, write_bytes, write_json
+from rangecheck.kernels import alone, thread_count
 
 MANIFEST = "frames.json"
 SCHEMA = "rangecheck/frames/1"
@@ -84,12 +86,15 @@ def render_frames(
     force: bool = False,
     progress: Callable[[int, int], None] | None = None,
     spread: Spread | None = None,
+    abreast: bool = True,
+    stands: Callable[[int], None] | None = None,
 ) -> list[Path]:
     """Make frames 0..frames-1 as files in `folder`, or those of them that are missing, and return their paths in order.
 
     frame(index) is the radiance of one frame, a pure function of its number; encode(radiance, exposure, index) is its file. `exposure`
     is a number, or a function of the pilot frames' radiances, asked once before the first frame is written and then kept in the
-    manifest. progress(done, frames) is called after each frame. An interruption leaves only whole files, and the next call with
+    manifest. progress(done, frames) is called after each frame, stands(index) for each whose file is whole, at once for those that were
+    there. Frames are made `abreast`, one on each thread, or all threads make one.  An interruption leaves only whole files, and the next call with
     the same key goes on to the same bytes. With `spread` (see `farm`) frames are made elsewhere, and `frame` is not called here.
 
     Raises OutputError when the folder holds frames of another job, or frames without a manifest, unless `force`, which removes
@@ -102,7 +107,10 @@ def render_frames(
     missing = [i for i, path in enumerate(paths) if not _finished(path, done.get(path.name))]
     if progress is not None:
         progress(frames - len(missing), frames)
-    made = spread if spread is not None else _one_after_the_other(frame)
+    made = spread if spread is not None else _abreast(frame) if abreast else _one_after_the_other(frame)
+    if stands is not None:
+        for index in sorted(set(range(frames)) - set(missing)):
+            stands(index)
     kept: dict[int, FloatArray] = {}
     if missing and manifest["exposure"] is None:
         if callable(exposure):
@@ -117,6 +125,8 @@ def render_frames(
         write_bytes(paths[index], content)
         done[paths[index].name] = hashlib.sha256(content).hexdigest()
         write_json(where / MANIFEST, manifest | {"done": dict(sorted(done.items()))})
+        if stands is not None:
+            stands(index)
 
     ready = chain(
         ((index, kept.pop(index)) for index in missing if index in kept), made([index for index in missing if index not in kept])
@@ -139,6 +149,36 @@ def render_frames(
 
 def _one_after_the_other(frame: Callable[[int], FloatArray]) -> Spread:
     return lambda indices: ((index, frame(index)) for index in indices)
+
+
+def _abreast(frame: Callable[[int], FloatArray]) -> Spread:
+    """Frames in order, as many in the making as there are threads, each on one of its own, and one that waits for its turn."""
+
+    def one(index: int) -> FloatArray:
+        with alone():
+            return frame(index)
+
+    def frames(indices: Sequence[int]) -> Iterator[tuple[int, FloatArray]]:
+        threads = min(thread_count(), len(indices))
+        if threads <= 1:
+            yield from _one_after_the_other(frame)(indices)
+            return
+        with ThreadPoolExecutor(threads, thread_name_prefix="frame-maker") as pool:
+            making: deque[tuple[int, Future[FloatArray]]] = deque()
+            try:
+                for index in indices:
+                    if len(making) > threads:
+                        done, result = making.popleft()
+                        yield done, result.result()
+                    making.append((index, pool.submit(one, index)))
+                while making:
+                    done, result = making.popleft()
+                    yield done, result.result()
+            finally:
+                for _, result in making:
+                    result.cancel()
+
+    return frames
 
 
 def _finished(path: Path, expected: str | None) -> bool:

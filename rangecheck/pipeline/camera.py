@@ -173,9 +173,11 @@ def out_of_focus(tracer: Tracer, lens: ThinLens, pose: FloatArray) -> tuple[Bool
 
 def image_of(film: Film, optics: Optics) -> FloatArray:
     """(h, w, c) float32 radiance before the backdrop, darkened towards the corners where that is asked for."""
-    image = film.radiance + (BACKDROP * (1 - film.coverage))[..., None].astype(film.radiance.dtype)
-    # a lamp behind the object is hidden by the backdrop
-    image[film.coverage == 0] = BACKDROP
+    behind, empty = (BACKDROP * (1 - film.coverage)).astype(film.radiance.dtype), film.coverage == 0
+    image = np.empty_like(film.radiance)
+    for c in range(image.shape[2]):
+        # a lamp behind the object is hidden by the backdrop
+        image[..., c] = np.where(empty, behind, film.radiance[..., c] + behind)
     falloff = optics.falloff()
     return image if falloff is None else (image * falloff[..., None]).astype(film.radiance.dtype)
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,16 +15,17 @@ import numpy.typing as npt
 
 from rangecheck import __version__
 from rangecheck.animation import Orbit, render_frames
-from rangecheck.animation.frames import MANIFEST
+from rangecheck.animation.frames import MANIFEST, frame_name
 from rangecheck.arrays import FloatArray
 from rangecheck.config import Settings
 from rangecheck.errors import OutputError, SettingError
 from rangecheck.export import legend
 from rangecheck.export.camera_files import write_camera_list, write_colmap
 from rangecheck.export.exr import exr_bytes, need_openexr, radiance_channels, read_exr
+from rangecheck.export.filming import Filming
 from rangecheck.export.mapped import contact_sheet
 from rangecheck.export.pictures import exposure_from, png_bytes, read_png, write_png
-from rangecheck.export.video import FORMATS, find_encoder, write_film
+from rangecheck.export.video import FORMATS, find_encoder
 from rangecheck.files import read_json
 from rangecheck.maps import trace_maps
 from rangecheck.pipeline.camera import Optics, camera_of, developed, image_of, optics_of, take
@@ -39,6 +42,9 @@ from rangecheck.surface import Surface
 from rangecheck.transport import Plan, Tracer
 
 Show = Literal["picture", "stripes", "distance", "id"]
+
+#: pixels of a frame up to which every thread makes one of its own: of larger ones, several at once would need gigabytes
+_ABREAST_PIXELS = 1 << 22
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,61 +180,65 @@ def render_turntable(
     scheduler: str | None = None,
 ) -> Rendered:
     """Frames of the orbit in one material, and their film. Frames that are there already are kept."""
-    made = _frames(surface, material_name, orbit, frames_dir, settings, reporter, force=force, scheduler=scheduler)
-    with reporter.stage(f"film, {made.name}"):
-        write_film(made.pictures(), film, settings.turntable.fps)
+    made = _planned(surface, material_name, lambda: orbit, frames_dir, settings, reporter)
+    with Filming(film, settings.turntable.fps, orbit.frames, made.picture) as filming:
+        _make(made, reporter, force, scheduler, filming.stands)
+        with reporter.stage(f"film, {made.name}"):
+            filming.finish()
     return Rendered(made.name, made.frames, film, made.plan, any(_mirrors(m) for m in made.job.scene.materials))
 
 
 @dataclass(frozen=True)
 class _Made:
-    """Finished frames of one material."""
+    """Frames of one material, planned or finished; `tracer` makes them here, and is None for maps."""
 
     name: str
     job: Job
     frames: list[Path]
     plan: list[str]
+    tracer: Tracer | None = dataclasses.field(repr=False)
 
-    def pictures(self) -> Iterator[npt.NDArray[np.uint8]]:
+    def picture(self, index: int) -> npt.NDArray[Any]:
+        """A finished frame as people are shown it."""
+        path = self.frames[index]
+        if path.suffix == ".png":
+            return read_png(path)
+        exposure = float(read_json(path.with_name(MANIFEST))["exposure"])
+        channels = read_exr(path)
+        if self.job.show == "id":
+            image = np.where(channels["part_id"] > 0, channels["part_id"], np.nan)
+        elif len(channels) == 1:
+            image = next(iter(channels.values()))[..., None] if self.job.plan else next(iter(channels.values()))
+        else:
+            image = np.stack([channels[name] for name in "RGB"], axis=-1)
+        return picture_of(self.job, image, exposure, index)
+
+    def pictures(self) -> Iterator[npt.NDArray[Any]]:
         """Every frame as people are shown it."""
-        exposure = 0.0
-        for index, path in enumerate(self.frames):
-            if path.suffix == ".png":
-                yield read_png(path)
-                continue
-            exposure = exposure or float(read_json(path.with_name(MANIFEST))["exposure"])
-            channels = read_exr(path)
-            if self.job.show == "id":
-                image = np.where(channels["part_id"] > 0, channels["part_id"], np.nan)
-            elif len(channels) == 1:
-                image = next(iter(channels.values()))[..., None] if self.job.plan else next(iter(channels.values()))
-            else:
-                image = np.stack([channels[name] for name in "RGB"], axis=-1)
-            yield picture_of(self.job, image, exposure, index)
+        return (self.picture(index) for index in range(len(self.frames)))
 
 
-def _frames(
+def _planned(
     subject: Surface | Subject,
     material_name: str,
-    orbit: Orbit,
+    orbit_when_found: Callable[[], Orbit],
     folder: Path,
     settings: Settings,
     reporter: Reporter,
-    *,
-    force: bool,
-    scheduler: str | None,
 ) -> _Made:
+    """Frames that are yet to be made, and how their light is followed. What needs no orbit is done before it is waited for."""
     known = subject if isinstance(subject, Subject) else Subject(material_name, subject)
     material, show = load_material(material_name), settings.turntable.show
-    optics = optics_of(settings, camera_of(settings), orbit.distance_mm)
-    if optics.sensor is not None and optics.sensor.bits > 8:
-        raise SettingError(f"sensor.bits is {optics.sensor.bits}; films and their frames have 8", key="sensor.bits")
     scene = scene_of(known, material, direct=settings.light.model == "direct", stripes=show == "stripes")
-    what = show if show in ("distance", "id") else material.name
-    tracer, plan, said = None, None, list(optics.reasons)
-    if show in ("picture", "stripes"):
-        with reporter.stage(f"planning light, {material.name}"):
-            tracer = Tracer(scene)
+    lit = show in ("picture", "stripes")
+    with reporter.stage(f"planning light, {material.name}" if lit else "framing"):
+        tracer = Tracer(scene) if lit else None
+        orbit = orbit_when_found()
+        optics = optics_of(settings, camera_of(settings), orbit.distance_mm)
+        if optics.sensor is not None and optics.sensor.bits > 8:
+            raise SettingError(f"sensor.bits is {optics.sensor.bits}; films and their frames have 8", key="sensor.bits")
+        plan, said = None, list(optics.reasons)
+        if tracer is not None:
             plan = plan_of(tracer, optics.camera, orbit.world_from_camera(0), settings)
             if show == "stripes" and not plan.grey:
                 plan = dataclasses.replace(
@@ -240,20 +250,19 @@ def _frames(
                     f"defocus: traced where circles of confusion exceed half a pixel, focused at {optics.lens.focus_mm:.4g} mm"
                 )
     job = Job(scene, show, settings.turntable.lights, optics, orbit, plan, settings.seed)
-    with reporter.stage(f"turntable, {what}", orbit.frames):
-        frames = _make(job, folder, reporter, force, scheduler, f".{settings.turntable.frame_format}", tracer)
-        poses = [orbit.world_from_camera(i) for i in range(orbit.frames)]
-        names = [path.name for path in frames]
-        write_camera_list(folder / "cameras.json", optics.asked, poses, names, optics.to_dict())
-        write_colmap(folder / "colmap", [optics.asked] * len(poses), poses, names)
-    return _Made(what, job, frames, said)
+    suffix = f".{settings.turntable.frame_format}"
+    frames = [folder / frame_name(index, orbit.frames, suffix) for index in range(orbit.frames)]
+    return _Made(material.name if lit else show, job, frames, said, tracer)
 
 
 def _make(
-    job: Job, folder: Path, reporter: Reporter, force: bool, scheduler: str | None, suffix: str, tracer: Tracer | None
-) -> list[Path]:
-    def made(frame: Callable[[int], FloatArray], spread: Any = None) -> list[Path]:
-        return render_frames(
+    made: _Made, reporter: Reporter, force: bool, scheduler: str | None, stands: Callable[[int], None] | None = None
+) -> None:
+    """Make the frames that are missing; `stands` is told of each that is there."""
+    job, folder, suffix = made.job, made.frames[0].parent, made.frames[0].suffix
+
+    def frames(frame: Callable[[int], FloatArray], spread: Any = None) -> None:
+        render_frames(
             frame,
             job.orbit.frames,
             folder,
@@ -264,15 +273,23 @@ def _make(
             force=force,
             progress=lambda done, _: reporter.advance(done),
             spread=spread,
+            abreast=job.optics.camera.width * job.optics.camera.height <= _ABREAST_PIXELS,
+            stands=stands,
         )
 
-    if scheduler is None:
-        return made(frames_of(job, tracer))
-    from rangecheck.animation.farm import Farm
+    with reporter.stage(f"turntable, {made.name}", job.orbit.frames):
+        if scheduler is None:
+            frames(frames_of(job, made.tracer))
+        else:
+            from rangecheck.animation.farm import Farm
 
-    with Farm(scheduler) as farm:
-        reporter.note(f"frames are made at {scheduler} by {farm.threads()} threads")
-        return made(_nowhere, farm.spread(frames_of, job, job.key()))
+            with Farm(scheduler) as farm:
+                reporter.note(f"frames are made at {scheduler} by {farm.threads()} threads")
+                frames(_nowhere, farm.spread(frames_of, job, job.key()))
+        poses = [job.orbit.world_from_camera(i) for i in range(job.orbit.frames)]
+        names = [path.name for path in made.frames]
+        write_camera_list(folder / "cameras.json", job.optics.asked, poses, names, job.optics.to_dict())
+        write_colmap(folder / "colmap", [job.optics.asked] * len(poses), poses, names)
 
 
 def exposure_of(images: Sequence[FloatArray]) -> float:
@@ -318,18 +335,26 @@ def turntable(
     elif settings.turntable.show == "stripes":
         for name in chosen:
             _need_mirror(load_material(name))
+    camera_of(settings)
     subject = read_subject(path, settings, unit, reporter)
-    orbit = orbit_of(subject.surface, settings)
     folder = Path(frames_dir) if frames_dir else film.with_name(f"{film.stem}-frames")
-    made = [
-        _frames(subject, name, orbit, folder if len(chosen) == 1 else folder / Path(name).stem, settings, reporter, force=force, scheduler=scheduler)
-        for name in chosen
-    ]  # fmt: skip
-    with reporter.stage("film"):
-        write_film(_side_by_side(made), film, settings.turntable.fps)
-        if sheet is not None:
-            numbers = [f"{360 * i / orbit.frames:.0f}°" for i in range(orbit.frames)]
-            write_png(sheet, contact_sheet(list(_side_by_side(made)), numbers))
+    made: list[_Made] = []
+    with ThreadPoolExecutor(1) as aside:
+        framing = aside.submit(orbit_of, subject.surface, settings)
+        for name in chosen:
+            if made:
+                _make(made[-1], reporter, force, scheduler)
+                made[-1] = dataclasses.replace(made[-1], tracer=None)
+            where = folder if len(chosen) == 1 else folder / Path(name).stem
+            made.append(_planned(subject, name, framing.result, where, settings, reporter))
+    orbit = framing.result()
+    with Filming(film, settings.turntable.fps, orbit.frames, partial(_beside_each_other, made)) as filming:
+        _make(made[-1], reporter, force, scheduler, filming.stands)
+        with reporter.stage("film"):
+            filming.finish()
+            if sheet is not None:
+                numbers = [f"{360 * i / orbit.frames:.0f}°" for i in range(orbit.frames)]
+                write_png(sheet, contact_sheet([_beside_each_other(made, i) for i in range(orbit.frames)], numbers))
     names = " | ".join(m.name for m in made)
     lines = [f"{out}: {orbit.frames} frames in {names}", f"frames are kept in {folder}"]
     lines += list(dict.fromkeys(line for m in made for line in m.plan))
@@ -353,14 +378,13 @@ def turntable(
     )  # fmt: skip
 
 
-def _side_by_side(made: Sequence[_Made]) -> Iterator[npt.NDArray[np.uint8]]:
-    """One picture after the other; those of several materials beside each other."""
-    for pictures in zip(*(m.pictures() for m in made), strict=True):
-        if len(pictures) == 1:
-            yield pictures[0]
-        else:
-            coloured = [p if p.ndim == 3 else np.repeat(p[..., None], 3, axis=2) for p in pictures]
-            yield np.concatenate(coloured, axis=1)
+def _beside_each_other(made: Sequence[_Made], index: int) -> npt.NDArray[Any]:
+    """Frame `index`; of several materials, beside each other."""
+    pictures = [m.picture(index) for m in made]
+    if len(pictures) == 1:
+        return pictures[0]
+    coloured = [p if p.ndim == 3 else np.repeat(p[..., None], 3, axis=2) for p in pictures]
+    return np.concatenate(coloured, axis=1)
 
 
 def _chosen(settings: Settings) -> tuple[str, ...]:

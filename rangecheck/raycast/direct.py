@@ -1,7 +1,7 @@
 """Embree's C interface, called from compiled code without the interpreter in between.
 
-embreex casts one ray per call of Embree; its wheel also carries Embree itself, whose packets of 16 neighbouring rays cost about half
-as much. Layouts are those of Embree 4 (rtcore_ray.h, rtcore_common.h); `load` proves them on a known triangle before they are used,
+embreex casts one ray per call of Embree; its wheel also carries Embree itself, whose packets of 16 or, without AVX-512, 8 neighbouring rays
+cost about half as much. Layouts are those of Embree 4 (rtcore_ray.h, rtcore_common.h); `load` proves them on a known triangle before they are used,
 and answers None (embreex then serves alone) where the library is not found, is not what it should be, or nothing is compiled.
 
 Local frame: centred and scaled so that the triangles fill [-1, 1]; float32, unit directions.
@@ -45,15 +45,20 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
     "rtcReleaseGeometry": (None, [_POINTER]),
     "rtcIntersect1": (None, [_POINTER] * 3),
     "rtcOccluded1": (None, [_POINTER] * 3),
+    "rtcIntersect8": (None, [_POINTER] * 4),
+    "rtcOccluded8": (None, [_POINTER] * 4),
     "rtcIntersect16": (None, [_POINTER] * 4),
     "rtcOccluded16": (None, [_POINTER] * 4),
 }
+#: what the engine's float32 may be off by, where numbers are about 1
+_ROUNDING = 4 * float(np.finfo(np.float32).eps)
 _TRIANGLES, _INDEX_BUFFER, _VERTEX_BUFFER, _UINT3, _FLOAT3 = 0, 0, 1, 0x5003, 0x9003
 _ROBUST = 1 << 2  # watertight at shared edges
-_PROPERTY_RAY16 = 34
+#: rays of a packet, the widest first, and the property that says whether the processor has them
+_WIDTHS = {16: 34, 8: 33}
 _COHERENT = 1 << 16
 
-# words of 4 bytes in RTCRayHit (one ray); in RTCRayHit16 each is a row of 16
+# words of 4 bytes in RTCRayHit (one ray); in a packet's each is a row of as many as it has rays
 _ORIGIN, _NEAR, _DIRECTION, _TIME, _FAR, _MASK, _ID, _FLAGS, _U, _V, _PRIMITIVE, _GEOMETRY, _INSTANCE = (
     0, 3, 4, 7, 8, 9, 10, 11, 15, 16, 17, 18, 19,
 )  # fmt: skip
@@ -97,7 +102,7 @@ def _device() -> int:
 def _proved(library: ctypes.CDLL) -> bool:
     """Whether one triangle answers single rays and packets as the layouts above say it must."""
     device = library.rtcNewDevice(b"threads=1")
-    if not device or library.rtcGetDeviceProperty(device, _PROPERTY_RAY16) != 1:
+    if not device or not _width(library, device):
         return False
     corners = np.array([[0, 0, 0.5], [1, 0, 0.5], [0, 1, 0.5]], np.float32)
     tree = DirectScene(corners, np.array([[0, 1, 2]], np.int32), library, device)
@@ -110,10 +115,17 @@ def _proved(library: ctypes.CDLL) -> bool:
         blocked = np.zeros(17, np.bool_)
         tree.closest(origins, directions, far, face, u, v, coherent)
         tree.occluded(origins, directions, np.full(17, 0.5 if coherent else 2.0, np.float32), blocked, coherent)
-        right = (far[:16] == 1).all() and (u[:16] == 0.25).all() and (v[:16] == 0.5).all() and (face[:16] == 0).all()
+        # older processors divide by an estimate and one step of Newton's method
+        met = np.abs(np.stack([far[:16] - 1, u[:16] - 0.25, v[:16] - 0.5])).max() <= _ROUNDING
+        right = met and (face[:16] == 0).all()
         if not (right and face[16] == -1 and (blocked[:16] != coherent).all() and not blocked[16]):
             return False
     return True
+
+
+def _width(library: ctypes.CDLL, device: int) -> int:
+    """Rays of the widest packets that the processor has; 0 where it has none that pay."""
+    return next((width for width, key in _WIDTHS.items() if library.rtcGetDeviceProperty(device, key) == 1), 0)
 
 
 def _commit(library: ctypes.CDLL, scene: int) -> None:
@@ -136,6 +148,7 @@ class DirectScene:
     ) -> None:
         library, device = library or load(), device or _device()
         assert library is not None
+        self._width = _width(library, device)
         self._scene = library.rtcNewScene(device)
         library.rtcSetSceneFlags(self._scene, _ROBUST)
         geometry = library.rtcNewGeometry(device, _TRIANGLES)
@@ -150,7 +163,7 @@ class DirectScene:
         weakref.finalize(self, library.rtcReleaseScene, self._scene)
         self._address = {
             name: ctypes.cast(getattr(library, name), _POINTER).value
-            for name in ("rtcIntersect1", "rtcIntersect16", "rtcOccluded1", "rtcOccluded16")
+            for name in ("rtcIntersect1", "rtcOccluded1", f"rtcIntersect{self._width}", f"rtcOccluded{self._width}")
         }
 
     def closest(
@@ -165,14 +178,16 @@ class DirectScene:
     ) -> None:
         """Fill `far`, `face` (-1 = missed), `u`, `v` with the first hits; `far` comes in as the reach of each ray."""
         if coherent:
-            _closest_packets(self._address["rtcIntersect16"], self._scene, origins, directions, far, face, u, v)
+            packets = self._address[f"rtcIntersect{self._width}"]
+            _closest_packets(packets, self._width, self._scene, origins, directions, far, face, u, v)
         else:
             _closest_single(self._address["rtcIntersect1"], self._scene, origins, directions, far, face, u, v)
 
     def occluded(self, origins: FloatArray, directions: FloatArray, far: FloatArray, blocked: Any, coherent: bool) -> None:
         """Fill `blocked` (n,) bool: whether anything lies within `far` of each ray's origin."""
         if coherent:
-            _occluded_packets(self._address["rtcOccluded16"], self._scene, origins, directions, far, blocked)
+            packets = self._address[f"rtcOccluded{self._width}"]
+            _occluded_packets(packets, self._width, self._scene, origins, directions, far, blocked)
         else:
             _occluded_single(self._address["rtcOccluded1"], self._scene, origins, directions, far, blocked)
 
@@ -271,51 +286,51 @@ def _occluded_single(function, scene, origins, directions, far, blocked):
 
 
 @inline_kernel
-def _fill_packet(ray, words, valid, origins, directions, far, first, count):
-    """Rays first..first+count into the 16 lanes; lanes that are left over, or hold a ray that is not finite, are switched off."""
-    for lane in range(16):
+def _fill_packet(ray, words, valid, width, origins, directions, far, first, count):
+    """Rays first..first+count into the lanes; lanes that are left over, or hold a ray that is not finite, are switched off."""
+    for lane in range(width):
         i = first + lane
         if lane < count and _finite_ray(origins, directions, i):
             valid[lane] = -1
             for axis in range(3):
-                ray[(_ORIGIN + axis) * 16 + lane] = origins[i, axis]
-                ray[(_DIRECTION + axis) * 16 + lane] = directions[i, axis]
-            ray[_FAR * 16 + lane] = far[i]
+                ray[(_ORIGIN + axis) * width + lane] = origins[i, axis]
+                ray[(_DIRECTION + axis) * width + lane] = directions[i, axis]
+            ray[_FAR * width + lane] = far[i]
         else:
             valid[lane] = 0
-            ray[_FAR * 16 + lane] = 0.0
-        words[_MASK * 16 + lane] = -1
-        words[_PRIMITIVE * 16 + lane] = words[_GEOMETRY * 16 + lane] = words[_INSTANCE * 16 + lane] = -1
+            ray[_FAR * width + lane] = 0.0
+        words[_MASK * width + lane] = -1
+        words[_PRIMITIVE * width + lane] = words[_GEOMETRY * width + lane] = words[_INSTANCE * width + lane] = -1
 
 
 @kernel
-def _closest_packets(function, scene, origins, directions, far, face, u, v):
-    """Sixteen rays per call: for rays whose neighbours in the list are neighbours in space."""
-    ray, lanes, arguments = _aligned(_WORDS * 16), _aligned(16), _coherent_arguments()
+def _closest_packets(function, width, scene, origins, directions, far, face, u, v):
+    """`width` rays per call: for rays whose neighbours in the list are neighbours in space."""
+    ray, lanes, arguments = _aligned(_WORDS * width), _aligned(16), _coherent_arguments()
     words, valid = ray.view(np.int32), lanes.view(np.int32)
     n = len(origins)
-    for first in range(0, n, 16):
-        count = min(16, n - first)
-        _fill_packet(ray, words, valid, origins, directions, far, first, count)
+    for first in range(0, n, width):
+        count = min(width, n - first)
+        _fill_packet(ray, words, valid, width, origins, directions, far, first, count)
         _call4(function, lanes.ctypes.data, scene, ray.ctypes.data, arguments.ctypes.data)
         for lane in range(count):
             i = first + lane
             if valid[lane] != 0:
-                far[i] = ray[_FAR * 16 + lane]
-            face[i] = words[_PRIMITIVE * 16 + lane]
-            u[i] = ray[_U * 16 + lane]
-            v[i] = ray[_V * 16 + lane]
+                far[i] = ray[_FAR * width + lane]
+            face[i] = words[_PRIMITIVE * width + lane]
+            u[i] = ray[_U * width + lane]
+            v[i] = ray[_V * width + lane]
 
 
 @kernel
-def _occluded_packets(function, scene, origins, directions, far, blocked):
-    """Sixteen shadow rays per call."""
-    ray, lanes, arguments = _aligned(_WORDS * 16), _aligned(16), _coherent_arguments()
+def _occluded_packets(function, width, scene, origins, directions, far, blocked):
+    """`width` shadow rays per call."""
+    ray, lanes, arguments = _aligned(_WORDS * width), _aligned(16), _coherent_arguments()
     words, valid = ray.view(np.int32), lanes.view(np.int32)
     n = len(origins)
-    for first in range(0, n, 16):
-        count = min(16, n - first)
-        _fill_packet(ray, words, valid, origins, directions, far, first, count)
+    for first in range(0, n, width):
+        count = min(width, n - first)
+        _fill_packet(ray, words, valid, width, origins, directions, far, first, count)
         _call4(function, lanes.ctypes.data, scene, ray.ctypes.data, arguments.ctypes.data)
         for lane in range(count):
-            blocked[first + lane] = ray[_FAR * 16 + lane] < 0.0
+            blocked[first + lane] = ray[_FAR * width + lane] < 0.0

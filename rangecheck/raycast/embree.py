@@ -5,7 +5,7 @@ distance 1e37; OCCLUDED answers 0 for blocked and -1 for free; an array given as
 count in units of |direction|; a ray with NaN is a silent miss; tnear is 0; it runs on one thread but without the interpreter lock,
 so callers cast chunks in threads (`kernels.in_chunks`).
 
-Where the library inside embreex can be called directly (`direct`), it is: watertight at shared edges, and sixteen rays at a time where the caller
+Where the library inside embreex can be called directly (`direct`), it is: watertight at shared edges, and several rays at a time where the caller
 says that neighbours in the list are neighbours in space.
 """
 

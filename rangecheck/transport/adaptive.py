@@ -13,26 +13,30 @@ that every pixel that sees a surface gets two groups before anything is judged.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 
 from rangecheck.arrays import FloatArray, IntArray
-from rangecheck.kernels import in_chunks, stage_kernel
+from rangecheck.kernels import in_chunks, inline_kernel, stage_kernel
 from rangecheck.optics import Camera
 from rangecheck.transport.camera_rays import pixel_order
 from rangecheck.transport.film import Film, Plate
 from rangecheck.transport.settings import Settings
+from rangecheck.transport.sight import GROUP, Sight
 from rangecheck.transport.tracer import Tracer
 
 #: rays in one group; two groups are the least from which a spread can be told
-EACH = 4
+EACH = GROUP
 #: pixels whose first sample may be off by less than this share of the error asked for are left alone
 _QUIET = 0.1
 #: groups per pixel at most grow so much from one round to the next, because their number rests on an estimate
 _GROWTH = 4
 #: rows of the picture that a thread looks at in one go
 _ROWS = 64
+#: numbers of groups whose gain is kept in a table
+_TABLED = 4096
 #: how the variance of a pixel falls with its number of groups: without and with chance in the gathering
 _DECAY_OF_EDGES, _DECAY_OF_NOISE = 1.25, 1.0
 
@@ -66,7 +70,9 @@ class Exposure:
         self._pixels = pixel_order(camera.width, camera.height)
         self._plate = Plate(camera.height, camera.width, tracer.scene.channels)
         once = replace(settings, passes=1, each=1, centre=True)
-        self._tally = tracer.expose(self._picture, self._pixels, once, seed, self._plate)
+        known = Sight.serves(len(tracer.scene.sources), settings.shadow_rays)
+        self._sight = Sight(camera.height, camera.width, len(tracer.scene.sources)) if known else None
+        self._tally = tracer.expose(self._picture, self._pixels, once, seed, self._plate, sight=self._sight)
         self._prior = unevenness(self._plate.mean, *self._plate.shape)
         self._groups, self._rays = np.zeros(len(self._pixels), np.int32), np.ones(len(self._pixels), np.int32)
 
@@ -90,7 +96,11 @@ class Exposure:
             fresh = more[groups[more] == 0]
             plate.erase(fresh)
             self._rays[fresh] = 0
-            self._tracer.expose(self._picture, more, self._settings, self._seed, plate, groups[more], wanted[more] - groups[more])
+            if self._sight is not None:
+                self._sight.settle()
+            self._tracer.expose(
+                self._picture, more, self._settings, self._seed, plate, groups[more], wanted[more] - groups[more], self._sight
+            )
             self._rays[more] += EACH * (wanted[more] - groups[more])
             groups[more] = wanted[more]
 
@@ -132,27 +142,47 @@ def _allot(prior: FloatArray, spread: FloatArray, groups: IntArray, allowed: flo
         return wanted
     quiet = float(prior.sum(dtype=np.float64) - prior[noisy].sum(dtype=np.float64))
     left = allowed * len(prior) - quiet
-    single, now = prior[noisy].astype(np.float64), groups[noisy]
-    deviation = np.sqrt(np.maximum(spread[noisy], 0.0).astype(np.float64))
-
-    def number(step: float) -> IntArray:
-        ideal = np.ceil(np.minimum((deviation / step) ** (2 / (1 + decay)), float(most)))
-        # one group tells nothing of its spread, and a pixel that needs less than one keeps its single sample
-        ideal = np.where(ideal > 1, ideal, np.where((now == 0) & (single <= deviation * step), 0, 2))
-        return np.maximum(now, np.minimum(ideal, most)).astype(np.int32)
-
-    def remains(count: IntArray) -> float:
-        return float(np.where(count > 0, spread[noisy] / np.maximum(count, 1.0) ** decay, single).sum())
-
-    if remains(now) <= left:
+    single, now, rough = prior[noisy].astype(np.float64), groups[noisy], np.maximum(spread[noisy], 0.0).astype(np.float64)
+    # groups that a pixel wants are a power of its deviation over a step that all pixels share
+    power = 2 / (1 + decay)
+    reach = rough ** (0.5 * power)
+    falls = np.arange(1, _TABLED + 1, dtype=np.float64) ** -decay
+    count = np.empty_like(now)
+    if _remains(now, rough, single, falls, decay) <= left:
         return wanted
-    low, high = 1e-6 * np.sqrt(allowed), float(deviation.max()) + np.sqrt(single.max())
+    low, high = 1e-6 * np.sqrt(allowed), float(np.sqrt(rough.max())) + np.sqrt(single.max())
     for _ in range(24):
         middle = np.sqrt(low * high)
-        low, high = (middle, high) if remains(number(middle)) <= left else (low, middle)
+        _number(reach, rough, single, now, middle**-power, middle, most, count)
+        low, high = (middle, high) if _remains(count, rough, single, falls, decay) <= left else (low, middle)
     # how many the goal asks for; that some places may not yet grow to it asks for no more in others
-    wanted[noisy] = np.minimum(number(low), np.maximum(2, _GROWTH * now))
+    _number(reach, rough, single, now, low**-power, low, most, count)
+    wanted[noisy] = np.minimum(count, np.maximum(2, _GROWTH * now))
     return wanted
+
+
+@stage_kernel
+def _number(reach, rough, single, now, scale, step, most, count):
+    """Groups of each pixel where one that is off by `step` squared is worth one more."""
+    for i in range(len(reach)):
+        ideal = math.ceil(min(reach[i] * scale, float(most)))
+        # one group tells nothing of its spread, and a pixel that needs less than one keeps its single sample
+        if ideal <= 1:
+            ideal = 0 if now[i] == 0 and single[i] <= math.sqrt(rough[i]) * step else 2
+        count[i] = max(now[i], min(np.int64(ideal), np.int64(most)))
+
+
+@stage_kernel
+def _remains(count, rough, single, falls, decay):
+    """Sum of the squared errors that so many groups leave; a pixel without any keeps that of its single sample."""
+    total = 0.0
+    for i in range(len(count)):
+        n = count[i]
+        if n == 0:
+            total += single[i]
+        else:
+            total += rough[i] * (falls[n - 1] if n <= len(falls) else float(n) ** -decay)
+    return total
 
 
 def unevenness(mean: FloatArray, height: int, width: int) -> FloatArray:
@@ -168,19 +198,30 @@ def _unevenness(mean, height, width, first, last, prior):
     """The same in rows first .. last - 1."""
     channels = mean.shape[1]
     for row in range(first, last):
+        above, below = max(row - 1, 0) * width, min(row + 1, height - 1) * width
         for column in range(width):
+            left, right, here = max(column - 1, 0), min(column + 1, width - 1), row * width + column
             worst = 0.0
-            for way in range(4):
-                dr, dc = (0, 1) if way == 0 else ((1, 0) if way == 1 else ((1, 1) if way == 2 else (1, -1)))
-                r0, r1 = max(row - dr, 0), min(row + dr, height - 1)
-                c0, c1 = min(max(column - dc, 0), width - 1), min(max(column + dc, 0), width - 1)
-                total = 0.0
-                for c in range(channels):
-                    here = mean[row * width + column, c]
-                    bend = mean[r0 * width + c0, c] + mean[r1 * width + c1, c] - 2.0 * here
-                    total += bend * bend
-                worst = max(worst, total / channels)
-            prior[row * width + column] = 0.25 * worst
+            if not _dark_around(mean, above, row * width, below, left, column, right):
+                for way in range(4):
+                    a = row * width + left if way == 0 else above + (column if way == 1 else left if way == 2 else right)
+                    b = row * width + right if way == 0 else below + (column if way == 1 else right if way == 2 else left)
+                    total = 0.0
+                    for c in range(channels):
+                        bend = mean[a, c] + mean[b, c] - 2.0 * mean[here, c]
+                        total += bend * bend
+                    worst = max(worst, total / channels)
+            prior[here] = 0.25 * worst
+
+
+@inline_kernel
+def _dark_around(mean, above, level, below, left, middle, right):
+    """Whether a pixel and its eight neighbours have seen no light, as most of many pictures has not."""
+    for c in range(mean.shape[1]):
+        for start in (above, level, below):
+            if mean[start + left, c] != 0.0 or mean[start + middle, c] != 0.0 or mean[start + right, c] != 0.0:
+                return False
+    return True
 
 
 @stage_kernel

@@ -11,10 +11,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from rangecheck.arrays import FloatArray, IntArray
+from rangecheck.arrays import BoolArray, FloatArray, IntArray
 from rangecheck.kernels import inline_kernel, stage_kernel
 from rangecheck.optics import Camera, OrthographicCamera, PinholeCamera
-from rangecheck.transport.chance import PIXEL, key_of, point, stream_of
+from rangecheck.transport.chance import PIXEL, fill_points, stream_of
+from rangecheck.transport.outline import pixels_of
 from rangecheck.transport.queues import CAMERA, Rays
 
 TILE, BLOCK = 64, 4
@@ -48,12 +49,20 @@ class PictureRays:
         self.rotation = np.ascontiguousarray(world_from_camera[:3, :3])
         self.eye = (world_from_camera[:3, 3] - centre_mm) / scale_mm
         self.scale_mm = scale_mm
+        #: what a tracer found of the pixels that may see anything, once it did
+        self.outline: list[BoolArray | None] = []
         if type(camera) is PinholeCamera and not any(camera.distortion):
             self._numbers = np.array([0.0, camera.fx, camera.fy, camera.cx, camera.cy])
         elif type(camera) is OrthographicCamera:
             self._numbers = np.array([1.0, camera.pixel_mm / scale_mm, camera.pixel_mm / scale_mm, camera.cx, camera.cy])
         else:
             self._numbers = np.empty(0)
+
+    def may_see(self, boxes: FloatArray) -> BoolArray | None:
+        """(width height,) whether a pixel may see what is in the boxes (k, 6) (see `outline`); None where this camera cannot tell."""
+        if not len(self._numbers):
+            return None
+        return pixels_of(boxes, self._numbers, self.rotation, self.eye, self.camera.width, self.camera.height)
 
     def start(
         self, pixels: IntArray, numbers: IntArray, each: int, centre: bool, seed: int, places: FloatArray, rays: Rays
@@ -63,7 +72,7 @@ class PictureRays:
         seed &= 0xFFFFFFFF
         width = self.camera.width
         if len(self._numbers) and self._numbers[0] == 0.0:
-            _start_pinhole(self._numbers, self.rotation, self.eye, pixels, numbers, width, each, centre, seed, rays)
+            _start_pinhole(self._numbers, self.rotation, self.eye, pixels, numbers, width, each, centre, seed, places, rays)
         else:
             _start_rays(pixels, numbers, width, each, centre, seed, places, rays)
             self.fill(places[0], places[1], rays.origin, rays.direction)
@@ -79,34 +88,35 @@ class PictureRays:
         )
 
 
-@inline_kernel
-def _begin(rays, k, i, each, stream, number):
-    """Ray k begins a path that carries its share of all the light to sample i."""
-    rays.far[k] = math.inf
-    rays.pixel[k] = i
-    rays.stream[k], rays.number[k] = stream, number
-    rays.kind[k] = rays.first[k] = CAMERA
-    for c in range(rays.weight.shape[1]):
-        rays.weight[k, c] = 1.0 / each
+@stage_kernel
+def _begin_all(pixels, numbers, each, seed, rays):
+    """Paths of group numbers[i] of `each` samples of pixel i, which together carry all the light that they find."""
+    k, share = np.int64(0), 1.0 / each
+    for i in range(len(pixels)):
+        stream = stream_of(seed, pixels[i])
+        for j in range(each):
+            rays.far[k] = math.inf
+            rays.pixel[k] = i
+            rays.stream[k], rays.number[k] = stream, numbers[i] * each + j
+            rays.kind[k] = rays.first[k] = CAMERA
+            for c in range(rays.weight.shape[1]):
+                rays.weight[k, c] = share
+            k += 1
 
 
 @stage_kernel
 def _start_rays(pixels, numbers, width, each, centre, seed, places, rays):
     """Pixel coordinates places (2, n each) of group numbers[i] of `each` samples of pixel i, and rays that together carry all the
     light that they find. The samples of one group are spread evenly over the pixel; `centre` puts a single one in its middle."""
-    k = np.int64(0)
-    for i in range(len(pixels)):
-        pixel = pixels[i]
+    _begin_all(pixels, numbers, each, seed, rays)
+    count = len(pixels) * each
+    if not centre:
+        fill_points(rays.stream, rays.number, PIXEL, 0, count, places[0], places[1])
+    for k in range(count):
+        pixel = pixels[rays.pixel[k]]
         row = pixel // width
-        stream = stream_of(seed, pixel)
-        for j in range(each):
-            places[0, k], places[1, k] = pixel - row * width, row
-            if not centre:
-                x, y = point(key_of(stream, PIXEL), numbers[i] * each + j)
-                places[0, k] += x - 0.5
-                places[1, k] += y - 0.5
-            _begin(rays, k, i, each, stream, numbers[i] * each + j)
-            k += 1
+        u, v = float(pixel - row * width), float(row)
+        places[0, k], places[1, k] = (u, v) if centre else (u + places[0, k] - 0.5, v + places[1, k] - 0.5)
 
 
 @inline_kernel
@@ -146,7 +156,7 @@ def _moved_rays(places, rays, rotation, eye, origins, directions):
 
 
 @stage_kernel
-def _start_pinhole(camera, rotation, eye, pixels, numbers, width, each, centre, seed, rays):
+def _start_pinhole(camera, rotation, eye, pixels, numbers, width, each, centre, seed, places, rays):
     """`_start_rays` and `_simple_rays` in one pass, for the camera that most pictures are taken with."""
     origin, direction = rays.origin, rays.direction
     fx, fy, cx, cy = 1.0 / camera[1], 1.0 / camera[2], camera[3], camera[4]
@@ -155,23 +165,21 @@ def _start_pinhole(camera, rotation, eye, pixels, numbers, width, each, centre, 
     gx, gy, gz = rotation[0, 2], rotation[1, 2], rotation[2, 2]
     ex, ey, ez = eye[0], eye[1], eye[2]
     per_row = 1.0 / width
-    k = np.int64(0)
-    for i in range(len(pixels)):
-        pixel = pixels[i]
+    _begin_all(pixels, numbers, each, seed, rays)
+    count = len(pixels) * each
+    if not centre:
+        fill_points(rays.stream, rays.number, PIXEL, 0, count, places[0], places[1])
+    for k in range(count):
+        pixel = pixels[rays.pixel[k]]
         # half a pixel keeps the product off whole numbers by more than it is rounded: exact, and far cheaper than dividing
         row = np.int64((pixel + 0.5) * per_row)
-        stream = stream_of(seed, pixel)
-        for j in range(each):
-            u, v = float(pixel - row * width), float(row)
-            if not centre:
-                p, q = point(key_of(stream, PIXEL), numbers[i] * each + j)
-                u, v = u + p - 0.5, v + q - 0.5
-            x, y = (u - cx) * fx, (v - cy) * fy
-            dx, dy, dz = x * ax + y * bx + gx, x * ay + y * by + gy, x * az + y * bz + gz
-            size = 1.0 / math.sqrt(x * x + y * y + 1.0)
-            dx, dy, dz = dx * size, dy * size, dz * size
-            skip = max(0.0, -(ex * dx + ey * dy + ez * dz) - 2.0)
-            origin[k, 0], origin[k, 1], origin[k, 2] = ex + skip * dx, ey + skip * dy, ez + skip * dz
-            direction[k, 0], direction[k, 1], direction[k, 2] = dx, dy, dz
-            _begin(rays, k, i, each, stream, numbers[i] * each + j)
-            k += 1
+        u, v = float(pixel - row * width), float(row)
+        if not centre:
+            u, v = u + places[0, k] - 0.5, v + places[1, k] - 0.5
+        x, y = (u - cx) * fx, (v - cy) * fy
+        dx, dy, dz = x * ax + y * bx + gx, x * ay + y * by + gy, x * az + y * bz + gz
+        size = 1.0 / math.sqrt(x * x + y * y + 1.0)
+        dx, dy, dz = dx * size, dy * size, dz * size
+        skip = max(0.0, -(ex * dx + ey * dy + ez * dz) - 2.0)
+        origin[k, 0], origin[k, 1], origin[k, 2] = ex + skip * dx, ey + skip * dy, ez + skip * dz
+        direction[k, 0], direction[k, 1], direction[k, 2] = dx, dy, dz

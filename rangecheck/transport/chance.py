@@ -13,26 +13,10 @@ import numpy as np
 
 from rangecheck.kernels import inline_kernel, stage_kernel
 
-#: what a key is for; a path's branch is BRANCH plus its kind, a source SHADOW plus its number
-PIXEL, LOBE_WAY, DIFFUSE_WAY, CHOICE, ORDER, SHADOW, BRANCH = 1, 2, 3, 4, 5, 1 << 16, 1 << 24
+#: what a key is for; a path's branch is BRANCH plus its kind, a source SHADOW or CHECK plus its number
+PIXEL, LOBE_WAY, DIFFUSE_WAY, CHOICE, ORDER, SHADOW, CHECK, BRANCH = 1, 2, 3, 4, 5, 1 << 16, 1 << 17, 1 << 24
 
 _TO_UNIT = 1.0 / 4294967296.0
-
-
-def _second_dimension():
-    """(4, 256) what each byte of an index adds (modulo 2) to Sobol's second dimension: Pascal's triangle modulo 2."""
-    directions = np.zeros(32, np.uint32)
-    directions[0] = 1 << 31
-    for k in range(1, 32):
-        directions[k] = directions[k - 1] ^ (directions[k - 1] >> np.uint32(1))
-    table = np.zeros((4, 256), np.uint32)
-    for byte in range(4):
-        for bit in range(8):
-            table[byte] ^= np.where(np.arange(256) >> bit & 1, directions[8 * byte + bit], 0).astype(np.uint32)
-    return table
-
-
-_SECOND = _second_dimension()
 
 
 @stage_kernel
@@ -81,10 +65,14 @@ def point(key, number):
     """The `number`-th point (two numbers in [0, 1)) of the sequence `key`."""
     # the first dimension of Sobol's points is the index with its bits reversed, which is how the hash leaves it
     index = _reversed_bits(_hashed(_reversed_bits(number), key))
-    second = _SECOND[0, index & np.uint32(255)] ^ _SECOND[1, (index >> np.uint32(8)) & np.uint32(255)]
-    second ^= _SECOND[2, (index >> np.uint32(16)) & np.uint32(255)] ^ _SECOND[3, index >> np.uint32(24)]
+    # the second is Pascal's triangle modulo 2 times the index (Lucas 1878: odd where the bits of one index hold those of the other)
+    second = index ^ ((index >> np.uint32(1)) & np.uint32(0x55555555))
+    second = second ^ ((second >> np.uint32(2)) & np.uint32(0x33333333))
+    second = second ^ ((second >> np.uint32(4)) & np.uint32(0x0F0F0F0F))
+    second = second ^ ((second >> np.uint32(8)) & np.uint32(0x00FF00FF))
+    second = np.uint32(second ^ (second >> np.uint32(16)))
     a = _reversed_bits(_hashed(index, _mixed(np.uint32(key) ^ np.uint32(0xA511E9B3))))
-    b = _reversed_bits(_hashed(_reversed_bits(second), _mixed(np.uint32(key) ^ np.uint32(0x63D83595))))
+    b = _reversed_bits(_hashed(second, _mixed(np.uint32(key) ^ np.uint32(0x63D83595))))
     return a * _TO_UNIT, b * _TO_UNIT
 
 
@@ -94,8 +82,25 @@ def turned(share):
     quarter = np.int64(4.0 * share + 0.5)
     x = (4.0 * share - quarter) * (0.5 * math.pi)
     y = x * x
-    c = 1.0 - y * (1 / 2 - y * (1 / 24 - y * (1 / 720 - y * (1 / 40320 - y * (1 / 3628800 - y / 479001600)))))
-    s = x * (1.0 - y * (1 / 6 - y * (1 / 120 - y * (1 / 5040 - y * (1 / 362880 - y / 39916800)))))
+    c = 1.0 - y * (1 / 2 - y * (1 / 24 - y * (1 / 720 - y * (1 / 40320 - y * (1 / 3628800 - y * (1 / 479001600))))))
+    s = x * (1.0 - y * (1 / 6 - y * (1 / 120 - y * (1 / 5040 - y * (1 / 362880 - y * (1 / 39916800))))))
     if quarter & 1:
         c, s = -s, c
     return (-c, -s) if quarter & 2 else (c, s)
+
+
+@stage_kernel
+def fill_points(streams, numbers, purpose, start, count, first, second):
+    """Points number numbers[start + k] of the sequences for `purpose` of streams[start + k], into first[k] and second[k]: a loop of
+    nothing else, which the compiler makes of eight points at a time."""
+    for k in range(count):
+        first[k], second[k] = point(key_of(streams[start + k], purpose), numbers[start + k])
+
+
+@stage_kernel
+def fill_disc(count, first, second):
+    """Points of the unit square become points of the unit disc, evenly spread; in place."""
+    for k in range(count):
+        radius = math.sqrt(first[k])
+        cos_turn, sin_turn = turned(second[k])
+        first[k], second[k] = radius * cos_turn, radius * sin_turn

@@ -12,10 +12,12 @@ import numpy as np
 
 from rangecheck.kernels import inline_kernel, pasted_kernel, stage_kernel
 from rangecheck.scene.sources import form_factor
-from rangecheck.transport.chance import SHADOW, key_of, point, turned
+from rangecheck.transport.chance import SHADOW, fill_disc, fill_points, key_of, point
 from rangecheck.transport.geometry import frame_around
 from rangecheck.transport.queues import DIFFUSE
 from rangecheck.transport.reflection import diffuse_of, lobe_of
+
+_PER_PI = 1.0 / math.pi
 
 
 @inline_kernel
@@ -37,7 +39,7 @@ def _put_gain(shadows, k, hits, i, materials, sources, source, dx, dy, dz, cosin
     total = diffuse = 0.0
     for c in range(shadows.gain.shape[1]):
         weight = hits.weight[i, c] * sources.radiance[source, c]
-        part = weight * diffuse_of(materials, material, c) * diffuse_light / math.pi
+        part = weight * diffuse_of(materials, material, c) * diffuse_light * _PER_PI
         gain = part
         if lobe_light > 0.0:
             toward = vx * dx + vy * dy + vz * dz
@@ -45,7 +47,7 @@ def _put_gain(shadows, k, hits, i, materials, sources, source, dx, dy, dz, cosin
         shadows.gain[k, c] = gain
         total += gain
         diffuse += part
-    shadows.diffuse_share[k] = diffuse / total if total > 0.0 else 0.0
+    shadows.diffuse_share[k] = 1.0 if lobe_light <= 0.0 else (diffuse / total if total > 0.0 else 0.0)
     return total > 0.0
 
 
@@ -55,6 +57,8 @@ def aim(sources, materials, hits, start, stop, rays_per_source, with_diffuse, wi
     k = np.int64(0)
     for s in range(len(sources.radius)):
         r2 = sources.radius[s] * sources.radius[s]
+        if rays_per_source > 0:
+            spread_over_source(hits, start, stop, s, rays_per_source, shadows)
         for i in range(start, stop):
             material = hits.material[i]
             nx, ny, nz = float(hits.shading[i, 0]), float(hits.shading[i, 1]), float(hits.shading[i, 2])
@@ -63,7 +67,8 @@ def aim(sources, materials, hits, start, stop, rays_per_source, with_diffuse, wi
             z = sources.centre[s, 2] - hits.place[i, 2]
             d2 = x * x + y * y + z * z
             distance = math.sqrt(d2)
-            x, y, z = x / distance, y / distance, z / distance
+            nearness = 1.0 / distance
+            x, y, z = x * nearness, y * nearness, z * nearness
             cosine = x * nx + y * ny + z * nz
             factor = form_factor(cosine, min(1.0, r2 / d2))
             if factor <= 0.0:
@@ -76,31 +81,49 @@ def aim(sources, materials, hits, start, stop, rays_per_source, with_diffuse, wi
                     _put_shadow(shadows, k, hits, i, x, y, z, distance - sources.radius[s], s)
                     k += 1
                 continue
-            k = _aim_soft(
-                sources, materials, hits, i, s, x, y, z, distance, rays_per_source, diffuse_light, shines, shadows, k
+            k = aim_soft(
+                sources, materials, hits, i, s, x, y, z, distance, rays_per_source, diffuse_light, shines, shadows,
+                (i - start) * rays_per_source, k,
             )  # fmt: skip
     return k
 
 
+@stage_kernel
+def spread_over_source(hits, start, stop, s, rays, shadows):
+    """Places on the disc that source s seems to be, `rays` for each of hits start..stop, one hit's after another's."""
+    if rays == 1:
+        fill_points(hits.stream, hits.number, SHADOW + s, start, stop - start, shadows.across, shadows.down)
+    else:
+        for i in range(start, stop):
+            key = key_of(hits.stream[i], SHADOW + s)
+            for j in range(rays):
+                k = (i - start) * rays + j
+                shadows.across[k], shadows.down[k] = point(key, hits.number[i] * rays + j)
+    fill_disc((stop - start) * rays, shadows.across, shadows.down)
+
+
 @pasted_kernel
-def _aim_soft(sources, materials, hits, i, s, x, y, z, distance, rays, diffuse_light, shines, shadows, k):
-    """Rays to places of source s, which stands wholly above the horizon or is cut by it.
+def aim_soft(sources, materials, hits, i, s, x, y, z, distance, rays, diffuse_light, shines, shadows, place, k):
+    """Rays to places of source s, from `place` on of those on its disc; it stands wholly above the horizon or is cut by it.
 
     Above: its directions' tangential parts fill an ellipse evenly (Nusselt 1928), so that every ray carries the same share of the exact
     irradiance, and only shadows make noise. Cut: rays spread evenly over its solid angle carry their cosines."""
     nx, ny, nz = float(hits.shading[i, 0]), float(hits.shading[i, 1]), float(hits.shading[i, 2])
     cosine = x * nx + y * ny + z * nz
-    sine2 = min(1.0, (sources.radius[s] / distance) ** 2)
+    sine = min(1.0, sources.radius[s] / distance)
+    sine2 = sine * sine
     whole = cosine > 0.0 and cosine * cosine > sine2
     depth = sine2 / (1.0 + math.sqrt(1.0 - sine2))
     ax, ay, az, bx, by, bz = frame_around(x, y, z)
-    key = key_of(hits.stream[i], SHADOW + s)
+    share = math.pi * sine2 * cosine / rays if whole else 2.0 * math.pi * depth / rays
     for j in range(rays):
-        p, q = point(key, hits.number[i] * rays + j)
-        cos_turn, sin_turn = turned(q)
-        along = 1.0 - depth if whole else 1.0 - p * depth
-        aside = math.sqrt(sine2 * p) if whole else math.sqrt(max(0.0, 1.0 - along * along))
-        e, f = aside * cos_turn, aside * sin_turn
+        across, down = shadows.across[place + j], shadows.down[place + j]
+        along, scale = 1.0 - depth, sine
+        if not whole:
+            # evenly over the solid angle: the height falls as the square of the disc's radius
+            height = depth * (across * across + down * down)
+            along, scale = 1.0 - height, math.sqrt(depth * (2.0 - height))
+        e, f = scale * across, scale * down
         dx, dy, dz = along * x + e * ax + f * bx, along * y + e * ay + f * by, along * z + e * az + f * bz
         up = dx * nx + dy * ny + dz * nz
         if whole:
@@ -109,7 +132,7 @@ def _aim_soft(sources, materials, hits, i, s, x, y, z, distance, rays, diffuse_l
             dx, dy, dz, up = dx + lift * nx, dy + lift * ny, dz + lift * nz, up + lift
         if up <= 0.0:
             continue
-        light = math.pi * sine2 * cosine / rays if whole else 2.0 * math.pi * depth * up / rays
+        light = share if whole else share * up
         straight = min(1.0, dx * x + dy * y + dz * z)
         reach = distance * (straight - math.sqrt(max(0.0, sine2 - (1.0 - straight * straight))))
         if _put_gain(

@@ -57,7 +57,7 @@ class Hits(NamedTuple):
 
 class Shadows(NamedTuple):
     """origin, direction (n, 3); far (n,); blocked (n,) bool; gain (n, c): what reaches the pixel if nothing is in the way;
-    diffuse_share (n,) of it; pixel, first (n,); source (n,)."""
+    diffuse_share (n,) of it; pixel, first (n,); source (n,); across, down (n,) float64: room for places on discs."""
 
     origin: FloatArray
     direction: FloatArray
@@ -68,6 +68,8 @@ class Shadows(NamedTuple):
     pixel: IntArray
     first: IntArray
     source: IntArray
+    across: FloatArray
+    down: FloatArray
 
 
 def _floats(*shape: int) -> FloatArray:
@@ -96,7 +98,7 @@ def new_shadows(n: int, channels: int) -> Shadows:
     """Room for n shadow rays."""
     return Shadows(
         _floats(n, 3), _floats(n, 3), _floats(n), np.empty(n, np.bool_),
-        _floats(n, channels), _floats(n), np.empty(n, np.int32), np.empty(n, np.uint8), np.empty(n, np.int16),
+        _floats(n, channels), _floats(n), np.empty(n, np.int32), np.empty(n, np.uint8), np.empty(n, np.int16), np.empty(n), np.empty(n),
     )  # fmt: skip
 
 

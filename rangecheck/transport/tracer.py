@@ -18,11 +18,12 @@ from threading import Lock
 import numpy as np
 
 from rangecheck import rigid
-from rangecheck.arrays import FloatArray, IntArray
+from rangecheck.arrays import BoolArray, FloatArray, IntArray
 from rangecheck.kernels import in_chunks
 from rangecheck.optics import Camera
 from rangecheck.raycast import EmbreeCaster
 from rangecheck.scene import Scene
+from rangecheck.scene.surroundings import CONSTANT
 from rangecheck.transport.camera_rays import PictureRays, pixel_order
 from rangecheck.transport.film import Film, Plate, expose
 from rangecheck.transport.geometry import geometry_of, sources_of
@@ -30,10 +31,12 @@ from rangecheck.transport.glint import CELLS, aim_glints, corner_places, find_gl
 from rangecheck.transport.irradiance import IrradianceCache, Stored, gather_irradiance, nothing_stored
 from rangecheck.transport.light import add_light, aim
 from rangecheck.transport.meet import meet
+from rangecheck.transport.outline import boxes_around, boxes_of
 from rangecheck.transport.queues import KIND_NAMES, LOBE, SPIKE, Hits, Rays, Shadows, Workspace
 from rangecheck.transport.reflection import materials_of
 from rangecheck.transport.scatter import choose_one, split
 from rangecheck.transport.settings import Settings
+from rangecheck.transport.sight import Sight, aim_unsettled, remember
 
 #: pixels that go through the stages together: two tiles
 CHUNK = 8192
@@ -54,6 +57,7 @@ class Tracer:
         self.surroundings = scene.surroundings.arrays(scene.channels)
         self.materials = materials_of(scene.materials)
         self.lights = (*(f"source {k}" for k in range(len(scene.sources))), "surroundings")
+        self._boxes: list[FloatArray] = []
         self._idle: list[Workspace] = []
         self._grey: Tracer | None = None
         self._coloured: Tracer | None = None
@@ -117,7 +121,7 @@ class Tracer:
         plate = Plate(camera.height, camera.width, self.scene.channels)
         picture = self.picture_rays(camera, world_from_camera)
         pixels = pixel_order(camera.width, camera.height)
-        tally = np.zeros((len(KIND_NAMES), settings.depth + 1, len(self.lights)))
+        tally = self._nothing(settings)
         for number in range(settings.passes):
             tally += self.expose(picture, pixels, settings, seed, plate, number)
         rays = plate.count * np.int32(settings.each)
@@ -137,12 +141,23 @@ class Tracer:
         plate: Plate,
         first: int | IntArray = 0,
         count: int | IntArray = 1,
+        sight: Sight | None = None,
     ) -> FloatArray:
         """Add observations number first .. first + count - 1 of each of the pixels, none named twice, to the plate.
+        `sight` is what is known of the sources' shadows in them, and learns of it.
 
         Returns the tally (first reflection, reflections, light) of their light."""
+        sees = self.may_see(picture, settings)
+        if sees is not None:
+            sees = sees[pixels]
+            # the others have seen darkness
+            plate.count[pixels[~sees]] += (
+                count if isinstance(count, int) else np.broadcast_to(count, len(pixels))[~sees].astype(np.int32)
+            )
+            first, count = (n if isinstance(n, int) else np.broadcast_to(n, len(pixels))[sees] for n in (first, count))
+            pixels = pixels[sees]
         if isinstance(first, int) and isinstance(count, int) and count == 1:
-            return self._expose_once(picture, pixels, settings, seed, plate, first)
+            return self._expose_once(picture, pixels, settings, seed, plate, first, sight)
         counts = np.broadcast_to(np.asarray(count, np.int64), len(pixels))
         firsts = np.broadcast_to(np.asarray(first, np.int64), len(pixels))
         ends = np.cumsum(counts)
@@ -157,25 +172,53 @@ class Tracer:
             before = np.repeat(ends[mine] - counts[mine], counts[mine]) - (ends[mine.start] - counts[mine.start])
             numbers = np.repeat(firsts[mine], counts[mine]) + np.arange(len(repeated)) - before
             with self._workspace() as work:
-                sample, face, tally = _Chunk(self, settings, work).shine(picture, repeated, numbers, seed)
+                sample, face, tally = _Chunk(self, settings, work, sight).shine(picture, repeated, numbers, seed)
                 expose(repeated, settings.each, sample, face, plate.mean, plate.spread, plate.covered, plate.count)
             return tally
 
-        return np.sum(in_chunks(chunk, len(pieces), 1), axis=0)
+        return np.sum([self._nothing(settings), *in_chunks(chunk, len(pieces), 1)], axis=0)
+
+    def may_see(self, picture: PictureRays, settings: Settings) -> BoolArray | None:
+        """Pixels that may see a surface or a source; None where all others see light too, or the camera cannot tell."""
+        if settings.backdrop and not self._dark:
+            return None
+        if not picture.outline:
+            if not self._boxes:
+                self._boxes.append(boxes_of(self.geometry.corners))
+            boxes = np.concatenate([self._boxes[0], boxes_around(self.sources)]) if len(self.sources.radius) else self._boxes[0]
+            picture.outline.append(picture.may_see(boxes))
+        return picture.outline[0]
+
+    @property
+    def _dark(self) -> bool:
+        around = self.scene.surroundings
+        return around.kind == CONSTANT and not around.low.any() and not around.boxes
 
     def _expose_once(
-        self, picture: PictureRays, pixels: IntArray, settings: Settings, seed: int, plate: Plate, number: int
+        self,
+        picture: PictureRays,
+        pixels: IntArray,
+        settings: Settings,
+        seed: int,
+        plate: Plate,
+        number: int,
+        sight: Sight | None,
     ) -> FloatArray:
         numbers = np.full(min(len(pixels), CHUNK), number, np.int64)
 
         def chunk(start: int, stop: int) -> FloatArray:
             mine = pixels[start:stop]
             with self._workspace() as work:
-                sample, face, tally = _Chunk(self, settings, work).shine(picture, mine, numbers[: stop - start], seed)
+                sample, face, tally = _Chunk(self, settings, work, sight).shine(picture, mine, numbers[: stop - start], seed)
                 expose(mine, settings.each, sample, face, plate.mean, plate.spread, plate.covered, plate.count)
             return tally
 
-        return np.sum(in_chunks(chunk, len(pixels), max(1, CHUNK // settings.each)), axis=0)
+        chunks = in_chunks(chunk, len(pixels), max(1, CHUNK // settings.each))
+        return np.sum([self._nothing(settings), *chunks], axis=0)
+
+    def _nothing(self, settings: Settings) -> FloatArray:
+        """A tally of no light."""
+        return np.zeros((len(KIND_NAMES), settings.depth + 1, len(self.lights)))
 
     def probe(self, picture: PictureRays, pixels: IntArray, settings: Settings, seed: int) -> FloatArray:
         """(passes, n, c) float32: `settings.passes` observations of each of a few pixels."""
@@ -203,9 +246,9 @@ class Tracer:
 class _Chunk:
     """One chunk's way through the stages, on one thread."""
 
-    def __init__(self, tracer: Tracer, settings: Settings, work: Workspace) -> None:
-        self._tracer, self._settings, self._work = tracer, settings, work
-        self._tally = np.zeros((len(KIND_NAMES), settings.depth + 1, len(tracer.lights)))
+    def __init__(self, tracer: Tracer, settings: Settings, work: Workspace, sight: Sight | None = None) -> None:
+        self._tracer, self._settings, self._work, self._sight = tracer, settings, work, sight
+        self._tally = tracer._nothing(settings)
         self._sample = work.samples(0)
         self._stored = tracer._stored(settings)
         # the light of the sources is kept too
@@ -270,9 +313,17 @@ class _Chunk:
         for start in range(0, count, step):
             stop = min(start + step, count)
             shadows = self._work.shadows((stop - start) * each)
-            k = aim(tracer.sources, tracer.materials, hits, start, stop, settings.shadow_rays, True, True, shadows)
+            sight = self._sight if reflections == 1 else None
+            if sight is None:
+                k = aim(tracer.sources, tracer.materials, hits, start, stop, settings.shadow_rays, True, True, shadows)
+            else:
+                k = aim_unsettled(
+                    tracer.sources, tracer.materials, hits, start, stop, sight.settled, self._pixels, shadows, self._sample, self._tally
+                )  # fmt: skip
             if k:
                 self._block(shadows, k, coherent=reflections == 1)
+                if sight is not None:
+                    remember(shadows, k, self._pixels, sight.lit, sight.dark)
                 add_light(shadows, k, reflections, self._sample, self._tally, LOBE)
 
     def _glints(self, hits: Hits, count: int) -> None:
