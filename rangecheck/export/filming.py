@@ -54,7 +54,8 @@ class Filming:
     def _pictures(self) -> Iterator[npt.NDArray[Any]]:
         for index in range(self._frames):
             with self._news:
-                self._news.wait_for(lambda index=index: index in self._standing or self._abandoned)
+                while index not in self._standing and not self._abandoned:
+                    self._news.wait()
                 if self._abandoned:
                     raise _Abandoned
             yield self._picture(index)

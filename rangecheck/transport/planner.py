@@ -38,7 +38,9 @@ _WORTH_KEEPING, _UNSEEN = 2.0, 0.2
 _ONE_IN, _FEWEST_PIXELS = 4, 320
 #: a form that may be off by more than this share of the peak is not tried
 _FORM_WORTH_A_TRY = 0.1
-_DEPTHS = (1, 2, 3, 4, 6, 10, 16)
+#: depths that are tried. Deeper, so few paths are left that following them costs next to nothing, while a pilot meets too few to tell what
+#: they carry: in crevices of bright surfaces that is far more than it finds
+_DEPTHS = (1, 2, 3, 4)
 
 
 class Planner:
@@ -165,8 +167,14 @@ class Planner:
             self.settings = replace(self.settings, depth=1)
             self.reasons.append("depth: light straight from the sources is all there is")
             return
+        narrow = 0.0
         for depth in _DEPTHS:
             cost, seen = self._cost(replace(self.settings, depth=depth))
+            # the deeper the light, the rarer it is in a pilot, whose product then misses it; its mean does not, and it is at least as unevenly
+            # spread as light of fewer reflections
+            mean = 0.5 * abs(float((seen[0] - self.seen[0]).mean() + (seen[1] - self.seen[1]).mean())) / self.mean
+            narrow = narrow if depth > _DEPTHS[0] else cost / mean if mean > 0 else 0.0
+            cost = max(cost, narrow * mean)
             allowed = self._allowed()
             if cost <= allowed:
                 self.settings, self.seen = replace(self.settings, depth=depth), seen
