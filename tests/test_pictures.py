@@ -9,6 +9,7 @@ import pytest
 
 from rangecheck.errors import ArrayError, DependencyMissing, InputError, OutputError
 from rangecheck.export import legend
+from rangecheck.export.filming import Filming
 from rangecheck.export.mapped import coloured_ids, coloured_map, contact_sheet, contour_picture, iso_lines
 from rangecheck.export.pictures import (
     develop,
@@ -203,6 +204,20 @@ def test_films_have_the_frames_they_were_given_and_the_same_bytes(tmp_path, suff
     for picture, original in zip(shown, frames):
         error = picture[:33, :41].reshape(-1, 3).mean(axis=0) - original.reshape(-1, 3).mean(axis=0)
         assert np.abs(error).max() < 4
+
+
+def test_a_film_made_beside_its_frames_is_the_one_made_after_them(tmp_path):
+    frames = [np.full((16, 24), 40 * k, np.uint8) for k in range(5)]
+    write_film(frames, tmp_path / "after.mp4")
+    with Filming(tmp_path / "beside.mp4", 24.0, 5, frames.__getitem__) as filming:
+        for index in (3, 0, 4, 2, 1):
+            filming.stands(index)
+        filming.finish()
+    assert (tmp_path / "beside.mp4").read_bytes() == (tmp_path / "after.mp4").read_bytes()
+    with pytest.raises(KeyboardInterrupt), Filming(tmp_path / "never.mp4", 24.0, 5, frames.__getitem__) as filming:
+        filming.stands(0)
+        raise KeyboardInterrupt
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["after.mp4", "beside.mp4"]
 
 
 def test_an_mp4_can_be_played_while_it_loads(tmp_path):

@@ -37,6 +37,8 @@ _GROWTH = 4
 _ROWS = 64
 #: numbers of groups whose gain is kept in a table
 _TABLED = 4096
+#: halvings of the range, some thirty octaves, in which the step lies
+_HALVINGS = 16
 #: how the variance of a pixel falls with its number of groups: without and with chance in the gathering
 _DECAY_OF_EDGES, _DECAY_OF_NOISE = 1.25, 1.0
 
@@ -88,7 +90,11 @@ class Exposure:
             allowed = (error * mean) ** 2
             if not allowed > 0:
                 return
-            _group_variance(plate.spread, groups, self._prior, *plate.shape, spread)
+            in_chunks(
+                lambda start, stop: _group_variance(plate.spread, groups, self._prior, *plate.shape, start, stop, spread),
+                plate.shape[0],
+                _ROWS,
+            )
             wanted = np.maximum(_allot(self._prior, spread, groups, allowed, self._most, decay), least)
             more = pixels[(wanted > groups)[pixels]]
             if not len(more):
@@ -151,7 +157,7 @@ def _allot(prior: FloatArray, spread: FloatArray, groups: IntArray, allowed: flo
     if _remains(now, rough, single, falls, decay) <= left:
         return wanted
     low, high = 1e-6 * np.sqrt(allowed), float(np.sqrt(rough.max())) + np.sqrt(single.max())
-    for _ in range(24):
+    for _ in range(_HALVINGS):
         middle = np.sqrt(low * high)
         _number(reach, rough, single, now, middle**-power, middle, most, count)
         low, high = (middle, high) if _remains(count, rough, single, falls, decay) <= left else (low, middle)
@@ -225,10 +231,10 @@ def _dark_around(mean, above, level, below, left, middle, right):
 
 
 @stage_kernel
-def _group_variance(spread, groups, prior, height, width, variance):
-    """Variance of one group's mean: pooled over the 5 x 5 pixels around, with the first guess as one more voice."""
+def _group_variance(spread, groups, prior, height, width, first, last, variance):
+    """Variance of one group's mean in rows first .. last - 1: pooled over the 5 x 5 pixels around, with the first guess as one more voice."""
     channels = spread.shape[1]
-    for row in range(height):
+    for row in range(first, last):
         for column in range(width):
             pixel = row * width + column
             # four rays spread evenly over an edge are off by an eighth of what one is
