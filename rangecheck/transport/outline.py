@@ -92,3 +92,16 @@ def _mark(boxes, camera, rotation, eye, seen):
             for column in range(max(np.int64(left - 1.0), np.int64(0)), min(np.int64(right + 2.0), np.int64(width - 1)) + 1):
                 seen[row, column] = True
     return True
+
+
+@stage_kernel
+def keep_seeing(outline, pixels, counts, observed, rows):
+    """Write rows of pixels inside the outline to `rows`, return how many; the others have seen darkness counts[i] (or counts[0]) times."""
+    kept, many = np.int64(0), len(counts) > 1
+    for i in range(len(pixels)):
+        if outline[pixels[i]]:
+            rows[kept] = i
+            kept += 1
+        else:
+            observed[pixels[i]] += counts[i if many else 0]
+    return kept

@@ -31,7 +31,7 @@ from rangecheck.transport.glint import CELLS, aim_glints, corner_places, find_gl
 from rangecheck.transport.irradiance import IrradianceCache, Stored, gather_irradiance, nothing_stored
 from rangecheck.transport.light import add_light, aim
 from rangecheck.transport.meet import meet
-from rangecheck.transport.outline import boxes_around, boxes_of
+from rangecheck.transport.outline import boxes_around, boxes_of, keep_seeing
 from rangecheck.transport.queues import KIND_NAMES, LOBE, SPIKE, Hits, Rays, Shadows, Workspace
 from rangecheck.transport.reflection import materials_of
 from rangecheck.transport.scatter import choose_one, split
@@ -147,15 +147,12 @@ class Tracer:
         `sight` is what is known of the sources' shadows in them, and learns of it.
 
         Returns the tally (first reflection, reflections, light) of their light."""
-        sees = self.may_see(picture, settings)
-        if sees is not None:
-            sees = sees[pixels]
-            # the others have seen darkness
-            plate.count[pixels[~sees]] += (
-                count if isinstance(count, int) else np.broadcast_to(count, len(pixels))[~sees].astype(np.int32)
-            )
-            first, count = (n if isinstance(n, int) else np.broadcast_to(n, len(pixels))[sees] for n in (first, count))
-            pixels = pixels[sees]
+        outline = self.may_see(picture, settings)
+        if outline is not None:
+            rows = np.empty(len(pixels), np.int32)
+            rows = rows[: keep_seeing(outline, pixels, np.atleast_1d(np.asarray(count, np.int32)), plate.count, rows)]
+            first, count = (n if isinstance(n, int) else np.broadcast_to(n, len(pixels))[rows] for n in (first, count))
+            pixels = pixels[rows]
         if isinstance(first, int) and isinstance(count, int) and count == 1:
             return self._expose_once(picture, pixels, settings, seed, plate, first, sight)
         counts = np.broadcast_to(np.asarray(count, np.int64), len(pixels))
