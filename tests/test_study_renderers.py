@@ -36,7 +36,8 @@ def test_the_effort_that_meets_a_goal_lies_between_two_that_were_measured():
 
 def test_pictures_are_timed_beside_their_cast():
     made = study(quick=True, part="cast")
-    assert [row["ratio"] > 0 and row["rays"] > 64 * 64 for row in made.tables["cast_ratios"]] == [True] * 4
+    # the bust fills about a fifth of the picture; rays beside it need not be cast
+    assert [row["ratio"] > 0 and row["rays"] > 64 * 64 / 5 for row in made.tables["cast_ratios"]] == [True] * 4
     assert len(made.findings) == 4
 
 

@@ -47,6 +47,9 @@ class LensRays(PictureRays):
         super().start(pixels, numbers, each, centre, seed, places, rays)
         _through_lens(self._lens, self.rotation, self.eye, len(pixels) * each, rays)
 
+    def may_see(self, boxes: FloatArray) -> None:
+        """Rays start anywhere on the lens: the outline that one point sees is not theirs."""
+
 
 @stage_kernel
 def _disc_point(a, b):
