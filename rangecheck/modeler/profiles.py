@@ -44,9 +44,10 @@ class Segment:
 
 def arc_chords(radius_mm: float, sweep_rad: float, error_mm: float) -> int:
     """Number of equal chords over `sweep_rad` that stay within `error_mm` of the circle: r (1 - cos(half step)) <= error."""
-    half = math.acos(max(-1.0, 1.0 - min(error_mm / radius_mm, 2.0)))
+    # 1 - cos(h) = 2 sin(h / 2)^2, which does not vanish for errors below the rounding of 1
+    half = max(2 * math.asin(math.sqrt(min(error_mm / radius_mm / 2, 1.0))), math.ulp(0.0))
     # never coarser than an eighth of a turn: a face must keep its shape however loose the tolerance
-    return max(1, math.ceil(sweep_rad / min(2 * half, math.pi / 4) - 1e-9))
+    return max(1, math.ceil(min(sweep_rad / min(2 * half, math.pi / 4), 1e12) - 1e-9))
 
 
 def segments(points: Sequence[Sequence[float]], name: str) -> list[Segment]:

@@ -52,7 +52,11 @@ def init(out: str, *, force: bool) -> Outcome:
     ]
     lines += _section(Settings, "")
     write_json(described, schemas()[CONFIGURATION], force=force)
-    write_bytes(path, ("\n".join(lines) + "\n").encode(), force=force)
+    try:
+        write_bytes(path, ("\n".join(lines) + "\n").encode(), force=force)
+    except OutputError:
+        described.unlink(missing_ok=True)  # alone it is of no use, and would stand in the way of the next try
+        raise
     return Outcome(
         document("init", output=out, json_schema=described),
         [

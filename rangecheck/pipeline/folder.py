@@ -43,10 +43,11 @@ def check_free(path: str | Path, finished: str, *, force: bool) -> None:
     # a job that was killed before it could say which it is leaves its lock and a half-written mark, nothing more
     if force or not path.is_dir() or all(one.name == LOCK or is_part(one) for one in path.iterdir()):
         return
+    if (path / UNFINISHED).exists():
+        return  # stopped on the way, or between its last file and the end: it goes on
     if (path / finished).exists():
         raise OutputError(path, "holds finished results; pass --force to replace them, or choose another folder")
-    if not (path / UNFINISHED).exists():
-        raise OutputError(path, "is not empty and holds no job of this kind; pass --force, or choose another folder")
+    raise OutputError(path, "is not empty and holds no job of this kind; pass --force, or choose another folder")
 
 
 @contextmanager
@@ -75,12 +76,23 @@ def job_folder(path: str | Path, key: str, finished: str, *, force: bool) -> Ite
 def _lock(path: Path) -> Iterator[None]:
     import fcntl
 
-    with (path / LOCK).open("w") as handle:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise OutputError(path, "another job is writing here; wait for it, or choose another folder") from None
-        try:
-            yield
-        finally:
-            (path / LOCK).unlink(missing_ok=True)
+    while True:
+        with (path / LOCK).open("w") as handle:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                raise OutputError(path, "another job is writing here; wait for it, or choose another folder") from None
+            if not _is_still(path / LOCK, handle.fileno()):
+                continue  # a job that ended meanwhile has taken its lock away
+            try:
+                yield
+            finally:
+                (path / LOCK).unlink(missing_ok=True)
+            return
+
+
+def _is_still(path: Path, handle: int) -> bool:
+    try:
+        return os.path.samestat(os.fstat(handle), path.stat())
+    except FileNotFoundError:
+        return False

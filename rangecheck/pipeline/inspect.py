@@ -144,9 +144,11 @@ def materials(names: Sequence[str], out: str | None, *, force: bool, reporter: R
     """Each material's numbers, source and energy table; with `out`, a polar plot of each there."""
     from rangecheck.files import write_bytes
     from rangecheck.reflectance import energy_table, load_material, material_names, polar_chart
+    from rangecheck.scan.readers.limits import plain_name
 
     lines: list[str] = []
     found: list[dict[str, Any]] = []
+    taken: set[str] = set()
     for name in names or material_names():
         material = load_material(name)
         with reporter.stage(f"energy of {material.name}"):
@@ -161,7 +163,7 @@ def materials(names: Sequence[str], out: str | None, *, force: bool, reporter: R
             for row in rows
         ]
         if out:
-            write_bytes(Path(out) / f"{material.name}.svg", polar_chart(material), force=force)
+            write_bytes(Path(out) / f"{plain_name(material.name, taken)}.svg", polar_chart(material), force=force)
         found.append(
             {
                 "name": material.name,

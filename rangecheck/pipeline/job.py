@@ -40,6 +40,7 @@ from rangecheck.progress import Reporter
 from rangecheck.reflectance import load_material
 from rangecheck.report import write_report
 from rangecheck.scan import RangeScan
+from rangecheck.scan.readers.limits import plain_name
 from rangecheck.solid import Finding, Verdict, finding, verdict
 from rangecheck.surface import INVENTED, ORIGIN_NAMES, Surface
 
@@ -94,19 +95,25 @@ def _made(
     )
     known = aside.submit(known_of, shown, ready.grids, orbit, settings)
     charted = aside.submit(_maps_and_contours, shown, read, folder, settings, front)
+    # a material may be a file anywhere; its turntable is called as the file is
+    taken = {"stripes"}
+    labels = {name: plain_name(Path(name).stem, taken) for name in settings.light.materials}
     turntables = [
-        render_turntable(
-            subject,
-            name,
-            orbit,
-            folder / f"{name}.mp4",
-            folder / "frames" / name,
-            settings,
-            reporter,
-            force=force,
-            scheduler=scheduler,
+        replace(
+            render_turntable(
+                subject,
+                name,
+                orbit,
+                folder / f"{label}.mp4",
+                folder / "frames" / label,
+                settings,
+                reporter,
+                force=force,
+                scheduler=scheduler,
+            ),
+            material=label,
         )
-        for name in settings.light.materials
+        for name, label in labels.items()
     ]
     turntables += _stripes(subject, orbit, folder, settings, reporter, force=force, scheduler=scheduler)
     consistency = _consistency(shown, ready.grids, orbit, turntables, folder, settings, reporter, known)

@@ -41,6 +41,7 @@ from rangecheck.report import (
     write_report,
 )
 from rangecheck.scan import RangeScan
+from rangecheck.scan.readers.limits import beside
 from rangecheck.solid import Verdict
 from rangecheck.surface import Surface
 
@@ -142,7 +143,12 @@ def report(folder: str, *, studies: Sequence[str] = (), reporter: Reporter) -> O
         raise InputError(where, "holds no finished job (no run.json); `rangecheck run` makes one")
     content = read_json(where / "run.json")
     with reporter.stage("report"):
-        write_report(page_of(where, content, studies), where / "report.html")
+        try:
+            page = page_of(where, content, studies)
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+            told = " ".join(f"{type(error).__name__}: {error}".split())[:160]
+            raise InputError(where / "run.json", f"is not what `rangecheck run` leaves ({told}); run the job again") from None
+        write_report(page, where / "report.html")
     size = (where / "report.html").stat().st_size
     return Outcome(
         document("report", output=where / "report.html", bytes=size),
@@ -169,7 +175,7 @@ def page_of(folder: Path, content: dict[str, Any], studies: Sequence[str | Path]
         turntables=[
             Turntable(t["material"], frames, content["settings"]["turntable"].get("start_deg", 0.0))
             for t in content["turntables"]
-            if (frames := sorted((folder / "frames" / t["material"]).glob("*.png")))
+            if (frames := sorted(beside(folder / "run.json", f"frames/{t['material']}").glob("*.png")))
         ],
         distance_maps=_distance_maps(folder),
         findings=[
@@ -248,7 +254,7 @@ def _scan(folder: Path, facts: dict[str, Any], quality: dict[str, Any] | None) -
     pictures = [
         Figure(kind, "", read_bytes(path), alt=f"{kind} of {name}")
         for kind in ("Brightness", "Contours")
-        if (path := folder / kind.lower() / f"{name}.png").is_file()
+        if (path := beside(folder / "run.json", f"{kind.lower()}/{name}.png")).is_file()
     ]
     return Scan(name, rows, pictures)
 

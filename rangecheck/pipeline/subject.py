@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +17,7 @@ from rangecheck.pipeline.preparing import Measured, prepared
 from rangecheck.progress import Reporter
 from rangecheck.scan import RangeScan
 from rangecheck.scan.point_cloud import PointCloud
+from rangecheck.scan.readers.limits import plain_name
 from rangecheck.surface import Surface
 
 if TYPE_CHECKING:
@@ -84,7 +85,9 @@ def read_all_scans(paths: Sequence[str | Path], unit: str | None, reporter: Repo
     for scan in scans:
         points += len(scan.points_mm) if isinstance(scan, PointCloud) else int(scan.need_points().valid.sum())
     reporter.note(f"{len(scans)} scan{'s' if len(scans) != 1 else ''}, {points:,} distances")
-    return scans
+    # a file may call its scan anything; results are written under these names
+    taken: set[str] = set()
+    return [scan if name == scan.name else replace(scan, name=name) for scan in scans for name in [plain_name(scan.name, taken)]]
 
 
 def surface_of(scans: Sequence[Measured], settings: Settings, reporter: Reporter) -> tuple[Surface, str, str]:

@@ -1,14 +1,14 @@
 """What the job survives: SIGKILL at random moments, a full disk at every stage, fifty subjects in one process.
 
-Moments of kills are drawn evenly from the time that the undisturbed job takes, each part with a seed of its own, so that the parts
-kills-1 ... kills-20 together are 200 kills. A killed job stays in its folder and the next kill strikes the job that takes it up again; every
-fifth is left to finish, and its bytes are compared.
+A killed job stays in its folder, and the next kill strikes the job that takes it up again. After one to four kills in a row it is left to
+finish, and its bytes are compared with the undisturbed job's. The parts kills-1 ... kills-5 together are 200 kills.
 """
 
 from __future__ import annotations
 
 import re
 import shutil
+import signal
 import subprocess
 import tempfile
 from collections.abc import Callable
@@ -19,65 +19,72 @@ from typing import Any
 import numpy as np
 
 from rangecheck.errors import RangecheckError
+from rangecheck.studies.forked_command import Forked, Moment, forked_command
 from rangecheck.studies.hardness_disk import DISK_PARTS
-from rangecheck.studies.hardness_jobs import SMALL, faults, left_over, small_scans, whole_files
-from rangecheck.studies.whole_commands import command, command_line, killed_after
+from rangecheck.studies.hardness_jobs import FINISHED, LOCK, SMALL, UNFINISHED, faults, left_over, small_scans, whole_files
+from rangecheck.studies.whole_commands import command_line
 from rangecheck.study import Part, study_of_parts
 from rangecheck.study.memory import held_mb
 
-KILLS, PIECES = 10, 20
-#: a job is left to finish after so many kills
-FINISH_AFTER = 5
+#: kills of one part, and parts: each has a seed of its own
+KILLS, PIECES = 40, 5
+#: kills that one job must bear before it is left to finish: one to so many
+MOST_IN_A_ROW = 4
 SUBJECTS, SETTLED, ALLOWED_GROWTH = 50, 3, 0.05
 
 
 def _kills_part(quick: bool, seed: int) -> Part:
-    kills, finish_after = (2, 2) if quick else (KILLS, FINISH_AFTER)
+    """Every other kill comes at a moment drawn evenly from the job's time, the rest at or a moment after one of its operations on files."""
+    kills = 6 if quick else KILLS
     random = np.random.default_rng(seed)
     rows: list[dict[str, Any]] = []
-    completed = same = 0
+    came_late = completed = same = 0
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        scans = small_scans(folder)
+        scans, out = small_scans(folder), folder / "killed"
 
-        def job(out: Path) -> list[str]:
-            return ["run", str(scans), "--out", str(out), *SMALL]
+        def job(to: Path) -> list[str]:
+            return ["run", str(scans), "--out", str(to), *SMALL]
 
-        command(*job(folder / "warm"))  # compiles, where nothing was kept
-        took = command(*job(folder / "undisturbed")).seconds
-        undisturbed = whole_files(folder / "undisturbed")
-        out = folder / "killed"
-        struck = 0
-        while struck < kills:
-            moment = float(random.uniform(0.0, took))
-            ended = killed_after(job(out), moment)
-            struck += not ended
-            wrong = faults(out, undisturbed)
-            finished = (out / "run.json").exists()  # killed after its last file, or not at all
-            row = {
-                "kill": struck,
-                "seconds": moment,
-                "ended_before": ended,
-                "files": len(whole_files(out)),
-                "half": wrong,
-                "same": None,
-            }
-            rows.append(row)
-            if not finished and struck % finish_after and struck < kills:
-                continue
-            if not finished:
-                command(*job(out))
-            completed += 1
-            row["same"] = whole_files(out) == undisturbed and (finished or not left_over(out))
-            same += bool(row["same"])
-            shutil.rmtree(out)
-        files = len(undisturbed)
-    half = [f"kill {row['kill']}: {', '.join(row['half'])}" for row in rows if row["half"]]
+        with forked_command(job(folder / "warm")) as command:
+            whole = command.run(job(folder / "undisturbed"))
+            undisturbed = whole_files(folder / "undisturbed")
+            left = int(random.integers(1, MOST_IN_A_ROW + 1))
+            while len(rows) < kills:
+                before = len(whole_files(out))
+                killed = command.run(job(out), _moment(random, whole, by_time=len(rows) % 2 == 0))
+                if killed.status == -signal.SIGKILL:
+                    left -= 1
+                    row = {"seconds": killed.seconds, "operations": killed.operations, "files_before": before}
+                    rows.append(row | {"files": len(whole_files(out)), "half": faults(out, undisturbed), "same": None})
+                else:
+                    came_late += 1  # what is taken up again has less to do than the undisturbed job
+                finished = (out / FINISHED).exists() and not (out / UNFINISHED).exists()
+                if not finished and left > 0 and len(rows) < kills:
+                    continue
+                if not finished:
+                    command.run(job(out))
+                completed += 1
+                ended_well = whole_files(out) == undisturbed and set(left_over(out)) <= ({LOCK} if finished else set())
+                same += ended_well
+                if rows:
+                    rows[-1]["same"] = ended_well
+                shutil.rmtree(out)
+                left = int(random.integers(1, MOST_IN_A_ROW + 1))
+    half = [f"kill {k + 1}: {', '.join(row['half'])}" for k, row in enumerate(rows) if row["half"]]
     finding = (
-        f"{kills} SIGKILLs struck a job of {took:.1f} s, at moments drawn from seed {seed} ({len(rows) - kills} more came after its end): "
-        f"{len(half)} times a half file under a final name; {same} of {completed} jobs taken up again ended with the bytes of all {files} files"
+        f"{kills} SIGKILLs struck a job of {whole.seconds:.1f} s and {whole.operations} operations on files ({came_late} more came after its "
+        f"end): {len(half)} times a half file under a final name; {same} of {completed} jobs taken up again, or struck after their last file, "
+        f"ended with the bytes of all {len(undisturbed)} files"
     )
     return Part(findings=[finding, *half], tables={f"kills_{seed}": rows})
+
+
+def _moment(random: np.random.Generator, whole: Forked, *, by_time: bool) -> Moment:
+    if by_time:
+        return Moment(seconds=float(random.uniform(0.0, whole.seconds)))
+    after = float(random.exponential(whole.seconds / whole.operations)) * float(random.integers(2))
+    return Moment(operation=int(random.integers(1, whole.operations + 1)), then_s=after)
 
 
 def _memory_part(quick: bool) -> Part:
