@@ -54,6 +54,17 @@ class Point(click.ParamType):
         return x, y, z
 
 
+def shipped(kind: str) -> Callable[..., list[str]]:
+    """Completes names of the shipped files of a kind: materials, printers, jobs."""
+
+    def complete(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
+        from rangecheck.files import presets_folder
+
+        return sorted(path.stem for path in (presets_folder() / kind).glob("*.toml") if path.stem.startswith(incomplete))
+
+    return complete
+
+
 _OPTIONS: dict[str, Callable[..., Any]] = {
     "unit": click.option("--unit", type=click.Choice(UNITS), help="Unit of length of inputs that do not say theirs."),
     "out": click.option("--out", "out", type=click.Path(), required=True, metavar="DIR", help="Folder for the results."),
@@ -66,7 +77,12 @@ _OPTIONS: dict[str, Callable[..., Any]] = {
     "size": click.option("--size", type=Size(), help="Picture size in pixels, WIDTHxHEIGHT."),
     "frames": click.option("--frames", type=click.IntRange(1), help="Frames of one full turn."),
     "frames_dir": click.option("--frames-dir", type=click.Path(), metavar="DIR", help="Where frames are kept between runs."),
-    "material": click.option("--material", metavar="NAME", help="A material of configs/materials, or a material file."),
+    "material": click.option(
+        "--material",
+        metavar="NAME",
+        shell_complete=shipped("materials"),
+        help="A material of configs/materials, or a material file.",
+    ),
     "tolerance": click.option(
         "--tolerance",
         metavar="P%",
@@ -262,4 +278,21 @@ def settings_from(config: str | None, assignments: tuple[str, ...], preset: str 
     """Resolved settings; dunder names in `overrides` stand for dots (turntable__frames)."""
     from rangecheck.config import load_settings
 
-    return load_settings(config, assignments, {key.replace("__", "."): value for key, value in overrides.items()}, preset)
+    settings = load_settings(config, assignments, {key.replace("__", "."): value for key, value in overrides.items()}, preset)
+    if settings.memory_mb is not None:
+        _bound_memory(int(settings.memory_mb * 1e6))
+    return settings
+
+
+def _bound_memory(most: int) -> None:
+    """No more than `most` bytes for this process, and for each that it starts, until the command ends. Where the system has no such bound,
+    nothing happens."""
+    try:
+        import resource
+
+        before = resource.getrlimit(resource.RLIMIT_DATA)
+        hardest = before[1] if before[1] != resource.RLIM_INFINITY else most
+        resource.setrlimit(resource.RLIMIT_DATA, (min(most, hardest), before[1]))
+    except (ImportError, ValueError, OSError):
+        return
+    click.get_current_context().call_on_close(lambda: resource.setrlimit(resource.RLIMIT_DATA, before))

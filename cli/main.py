@@ -94,14 +94,15 @@ def exit_status(arguments: list[str] | None = None) -> int:
         print(error.ctx.get_help() if error.ctx else "", file=sys.stderr)  # noqa: T201
         return 2
     except click.ClickException as error:
-        return _complain(error.format_message(), hint=isinstance(error, click.UsageError))
+        asked = error.ctx.command_path if isinstance(error, click.UsageError) and error.ctx else ""
+        return _complain(error.format_message(), hint=asked)
     except (KeyboardInterrupt, click.exceptions.Abort):
         return _complain("interrupted; what was finished is kept", status=130)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except MemoryError:
-        return _complain("out of memory; try a larger meshing.voxel_mm or smaller pictures")
+        return _complain("out of memory; try a larger meshing.voxel_mm, smaller pictures, or a higher memory_mb where it was set")
     except Exception as error:
         from rangecheck.errors import PosesRefused, RangecheckError
 
@@ -113,8 +114,8 @@ def exit_status(arguments: list[str] | None = None) -> int:
         raise
 
 
-def _complain(message: str, *, status: int = 2, hint: bool = False) -> int:
+def _complain(message: str, *, status: int = 2, hint: str = "") -> int:
     print(f"rangecheck: {' '.join(message.split())}", file=sys.stderr)  # noqa: T201
     if hint:
-        print("rangecheck: see rangecheck COMMAND --help", file=sys.stderr)  # noqa: T201
+        print(f"rangecheck: see {hint} --help", file=sys.stderr)  # noqa: T201
     return status

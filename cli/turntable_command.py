@@ -2,13 +2,18 @@
 
 import click
 
-from .common import common, settings_from
+from .common import common, settings_from, shipped
 
 
 @click.command("turntable", short_help="Frames and video of an orbit; resumes where it was stopped.")
 @click.argument("scene", type=click.Path())
 @click.option(
-    "--material", "materials", multiple=True, metavar="NAME", help="A material; given twice, both are shown side by side."
+    "--material",
+    "materials",
+    multiple=True,
+    metavar="NAME",
+    shell_complete=shipped("materials"),
+    help="A material; given twice, both are shown side by side.",
 )
 @click.option(
     "--show",

@@ -142,6 +142,42 @@ def test_shells_are_told_how_to_complete(capsys):
         assert "_RANGECHECK_COMPLETE" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("words", "completed"),
+    [
+        ("run --pres", "--preset"),
+        ("explain open", "open-edges"),
+        ("render x.ply --material st", "steel"),
+        ("study hard", "hardness"),
+    ],
+)
+def test_shells_complete_options_and_the_names_of_what_there_is(words, completed, capsys, monkeypatch):
+    monkeypatch.setenv("COMP_WORDS", f"rangecheck {words}")
+    monkeypatch.setenv("COMP_CWORD", str(len(words.split())))
+    monkeypatch.setenv("_RANGECHECK_COMPLETE", "bash_complete")
+    with pytest.raises(SystemExit):
+        importlib.import_module("rangecheck_cli.main").cli.main(prog_name="rangecheck")
+    assert f"plain,{completed}" in capsys.readouterr().out.splitlines()
+
+
+def test_wrong_usage_names_the_help_of_its_own_command(capsys):
+    assert exit_status(["turntable", "x.ply", "-o", "y.mp4", "--size", "3"]) == 2
+    assert "see rangecheck turntable --help" in capsys.readouterr().err
+
+
+def test_a_job_takes_no_more_memory_than_it_may(tmp_path):
+    """In a process of its own: an address space that was once grown does not shrink again."""
+    from rangecheck.export.meshes import write_mesh
+    from rangecheck.studies.scenes import ball
+
+    write_mesh(ball(2, 40.0), tmp_path / "ball.ply")
+    line = ["render", str(tmp_path / "ball.ply"), "--unit", "mm", "--size", "8192x8192", "-o", str(tmp_path / "ball.png")]
+    line += ["--set", "memory_mb=700"]
+    done = subprocess.run([sys.executable, "-m", "rangecheck_cli", *line, "-q"], capture_output=True, text=True)
+    assert done.returncode == 2 and "out of memory" in done.stderr and len(done.stderr.splitlines()) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["ball.ply"]
+
+
 def test_a_log_holds_what_was_done_and_how_it_ended(capsys, tmp_path):
     log = tmp_path / "logs" / "a b.log"
     assert exit_status(["explain", "open-edges", "--log", str(log)]) == 0

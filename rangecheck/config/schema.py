@@ -219,6 +219,10 @@ class Settings(Section):
 
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     threads: Annotated[int, Field(ge=0, le=1024)] = Field(0, description="0 means all cores; results do not depend on it")
+    memory_mb: Annotated[float, Field(ge=256, allow_inf_nan=False)] | None = Field(
+        None,
+        description="most memory that a command may take; one that needs more ends and says so. Without it, what the machine has",
+    )
     scan: Scanning = Scanning()
     meshing: Meshing = Meshing()
     solid: Solidify = Solidify()

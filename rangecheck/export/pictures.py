@@ -29,6 +29,8 @@ LIT_SHARE = 1e-4
 #: at most this many pixels of each frame are looked at, evenly spread
 SAMPLED_PIXELS = 65536
 PNG_LEVEL = 4
+#: rows that are developed in one go: what is needed on the way is several times the picture
+DEVELOPED_ROWS = 256
 
 Picture = npt.NDArray[np.uint8]
 
@@ -64,8 +66,11 @@ def develop(radiance: FloatArray, exposure: float = 1.0, background: float = 0.0
     image = _checked(radiance)
     if not (np.isfinite(exposure) and exposure > 0):
         raise ArrayError(f"exposure is {exposure}; it must be a positive number", name="exposure")
-    levels = srgb(image.astype(np.float32) * np.float32(exposure))
-    return np.rint(255.0 * np.where(np.isnan(levels), background, levels)).astype(np.uint8)
+    picture = np.empty(image.shape, np.uint8)
+    for rows in (slice(first, first + DEVELOPED_ROWS) for first in range(0, len(image), DEVELOPED_ROWS)):
+        levels = srgb(image[rows].astype(np.float32) * np.float32(exposure))
+        picture[rows] = np.rint(255.0 * np.where(np.isnan(levels), background, levels))
+    return picture
 
 
 def _checked(radiance: FloatArray) -> FloatArray:

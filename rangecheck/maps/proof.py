@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from rangecheck.arrays import FloatArray
+from rangecheck.kernels import in_chunks
 from rangecheck.maps.trace import Maps, require_same
 from rangecheck.rigid import move_points
 from rangecheck.surface import Surface
 
 #: stated bound of back-projection, as a share of the surface's extent
 BOUND = 1e-6
+#: pixels that are sent back in one go
+PIXELS_AT_ONCE = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -54,24 +59,41 @@ def point_triangle_mm(points_mm: FloatArray, triangles: FloatArray) -> FloatArra
 def back_projection_error(surface: Surface, maps: Maps) -> BackProjection:
     """Send every pixel back, once by its distance and once by its depth, and measure how far it lands from the face it hit."""
     require_same(surface, maps.face)
-    origins, directions = maps.camera.pixel_rays()
-    axial = directions[..., 2]
-    hit = maps.hit
-    triangles = surface.triangles[maps.face[hit]]
-
-    def errors(along: FloatArray) -> FloatArray:
-        points = move_points(maps.world_from_camera, origins[hit] + along[:, None] * directions[hit])
-        return point_triangle_mm(points, triangles)
-
-    by_distance = errors(maps.distance_mm[hit])
-    # a ray across the optical axis has no depth to go back by
-    with np.errstate(divide="ignore", invalid="ignore"):
-        reach = (maps.depth_mm[hit] - origins[hit][:, 2]) / axial[hit]
-    by_depth = errors(np.where(np.abs(axial[hit]) > 1e-3, reach, maps.distance_mm[hit]))
+    height, width = maps.face.shape
+    rows = max(1, PIXELS_AT_ONCE // width)
+    bands = in_chunks(lambda first, last: _band(surface, maps, first, last), height, rows)
+    pixels = sum(band.pixels for band in bands)
     return BackProjection(
-        pixels=int(hit.sum()),
-        distance_max_mm=float(by_distance.max(initial=0.0)),
-        distance_rms_mm=float(np.sqrt((by_distance**2).mean())) if len(by_distance) else 0.0,
-        depth_max_mm=float(by_depth.max(initial=0.0)),
+        pixels=pixels,
+        distance_max_mm=max(band.distance_max_mm for band in bands),
+        distance_rms_mm=math.sqrt(sum(band.distance_squares for band in bands) / max(pixels, 1)),
+        depth_max_mm=max(band.depth_max_mm for band in bands),
         bound_mm=BOUND * surface.extent_mm,
     )
+
+
+class _Band(NamedTuple):
+    pixels: int
+    distance_max_mm: float
+    distance_squares: float
+    depth_max_mm: float
+
+
+def _band(surface: Surface, maps: Maps, first: int, last: int) -> _Band:
+    """Rows first .. last - 1: what all pixels need at once would be many times the maps themselves."""
+    face = maps.face[first:last]
+    row, column = np.nonzero(face >= 0)
+    camera_origins, camera_rays = maps.camera.rays(column.astype(float), (row + first).astype(float))
+    corners = surface.vertices[surface.faces[face[row, column]]]
+    distance, depth = maps.distance_mm[first:last][row, column], maps.depth_mm[first:last][row, column]
+
+    def errors(along: FloatArray) -> FloatArray:
+        return point_triangle_mm(move_points(maps.world_from_camera, camera_origins + along[:, None] * camera_rays), corners)
+
+    by_distance = errors(distance)
+    axial = camera_rays[:, 2]
+    # a ray across the optical axis has no depth to go back by
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reach = (depth - camera_origins[:, 2]) / axial
+    by_depth = errors(np.where(np.abs(axial) > 1e-3, reach, distance))
+    return _Band(len(row), float(by_distance.max(initial=0.0)), float((by_distance**2).sum()), float(by_depth.max(initial=0.0)))

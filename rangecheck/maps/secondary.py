@@ -16,6 +16,7 @@ from rangecheck.errors import ArrayError
 from rangecheck.kernels import in_chunks, kernel
 from rangecheck.maps.trace import PIXELS_PER_CHUNK, Caster, Maps, measure_hits, require_same
 from rangecheck.raycast import EmbreeCaster
+from rangecheck.rigid import move_points
 from rangecheck.surface import Surface
 from rangecheck.surface.attributes import barycentric
 
@@ -105,17 +106,18 @@ def trace_chain(
     pixels = np.flatnonzero(maps.hit)
     faces = np.full((bounces, maps.face.size), -1, np.int32)
     w = maps.camera.width
-    points = maps.points_mm().reshape(-1, 3)
+    distance_mm = maps.distance_mm.ravel()
     skin_mm = SKIN * surface.extent_mm
     rotation = maps.world_from_camera[:3, :3]
 
     def chunk(start: int, stop: int) -> None:
         live = pixels[start:stop]
         face = maps.face.ravel()[live]
-        point = points[live]
-        directions = np.ascontiguousarray(maps.camera.rays((live % w).astype(float), (live // w).astype(float))[1] @ rotation.T)
+        starts, rays = maps.camera.rays((live % w).astype(float), (live // w).astype(float))
+        point = move_points(maps.world_from_camera, starts + distance_mm[live, None] * rays)
+        directions = np.ascontiguousarray(rays @ rotation.T)
         for bounce in range(bounces):
-            facet = np.nan_to_num(surface.face_normals[face])
+            facet = np.nan_to_num(surface.normals_of(face))
             normal = facet if normals is None else normals(point, face)
             origins = np.empty_like(point)
             reflect(directions, facet, normal, point, skin_mm, origins)

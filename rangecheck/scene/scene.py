@@ -78,7 +78,8 @@ class Scene:
         outside = np.maximum(np.maximum(low - source.centre_mm, source.centre_mm - high), 0.0)
         if float(np.linalg.norm(outside)) > source.radius_mm or not len(self.surface.faces):
             return
-        nearest = float(_distance_to_triangles(source.centre_mm, self.surface.triangles).min())
+        corners = (self.surface.vertices[self.surface.faces[piece]] for piece in self.surface.pieces())
+        nearest = min(float(_distance_to_triangles(source.centre_mm, some).min()) for some in corners)
         if nearest <= source.radius_mm:
             raise SceneError(
                 f"the source at {np.array2string(source.centre_mm, precision=4)} with radius {source.radius_mm:g} mm reaches into the "
@@ -106,7 +107,10 @@ class Scene:
         if known is None:
             known = self.surface.vertex_normals if smooth.any() else np.zeros((0, 3))
         if known.ndim == 2:
-            corner_normals_into(self.surface.faces, self.surface.face_normals, smooth, known, normals)
+            for piece in self.surface.pieces():
+                corner_normals_into(
+                    self.surface.faces[piece], self.surface.normals_of(piece), smooth[piece], known, normals[piece]
+                )
             return normals
         flat = np.nan_to_num(self.surface.face_normals)
         flat[(flat == 0).all(axis=1)] = (0.0, 0.0, 1.0)

@@ -84,10 +84,12 @@ def open_mesh(path: str | Path, unit: str | None = None) -> MeshFile:
         vertices, faces = _welded(vertices, faces, notes)
     own = vertices
     lowered = lowered_in(_head(content, kind))
+    del content
     if lowered is not None:
         vertices = turned_back(vertices, lowered)
         notes.append("it stands with z up, as slicers take it; read in the frame of its scans, y up")
-    return MeshFile(Surface(vertices * mm_per(unit), faces, part_names=(path.stem,)), kind, unit, tuple(notes), own, records)
+    in_mm = vertices if mm_per(unit) == 1.0 else vertices * mm_per(unit)
+    return MeshFile(Surface(in_mm, faces, part_names=(path.stem,)), kind, unit, tuple(notes), own, records)
 
 
 def _head(content: bytes, kind: str) -> bytes:
@@ -132,7 +134,7 @@ def _welded(vertices: FloatArray, faces: IntArray, notes: list[str]) -> tuple[Fl
     """Vertices that faces name become one where their coordinates are equal; vertices that no face names stay."""
     used = np.zeros(len(vertices), bool)
     used[faces.ravel()] = True
-    first, number = weld_exactly(vertices[used])
+    first, number = weld_exactly(vertices if used.all() else vertices[used])
     if len(first) == len(number):
         return vertices, faces
     notes.append(f"{len(number)} vertices were welded to {len(first)} where their coordinates are equal")

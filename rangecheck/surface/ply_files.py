@@ -53,7 +53,7 @@ def ply_mesh(path: Path, content: bytes) -> tuple[FloatArray, IntArray, list[str
     if "face" not in names:
         what = "a range scan, not a mesh" if "range_grid" in names else "points without faces"
         raise InputError(path, f"holds {what}; mesh it first (rangecheck mesh)")
-    reader = _AsciiBody(path, body) if form == "ascii" else _BinaryBody(path, body, "<" if "little" in form else ">")
+    reader = _AsciiBody(path, bytes(body)) if form == "ascii" else _BinaryBody(path, body, "<" if "little" in form else ">")
     vertices = faces = None
     for element in elements:
         columns = reader.element(element)
@@ -61,7 +61,9 @@ def ply_mesh(path: Path, content: bytes) -> tuple[FloatArray, IntArray, list[str
             missing = [axis for axis in "xyz" if axis not in columns]
             if missing:
                 raise InputError(path, f"its vertices have no {', '.join(missing)}; export it again")
-            vertices = np.stack([np.asarray(columns[axis], np.float64) for axis in "xyz"], axis=1)
+            vertices = np.empty((element.count, 3))
+            for k, axis in enumerate("xyz"):
+                vertices[:, k] = columns[axis]
         elif element.name == "face":
             name = next((n for n in _LIST_NAMES if n in columns), None)
             if name is None:
@@ -76,14 +78,14 @@ def ply_mesh(path: Path, content: bytes) -> tuple[FloatArray, IntArray, list[str
     return vertices, _triangles(faces, notes), notes
 
 
-def _header(path: Path, content: bytes) -> tuple[str, list[_Element], bytes]:
+def _header(path: Path, content: bytes) -> tuple[str, list[_Element], memoryview]:
     if content[:3] != b"ply":
         raise InputError(path, "does not begin with 'ply'; it is no PLY file")
     end = content.find(b"end_header", 0, 1 << 20)
     if end < 0:
         raise InputError(path, "its header does not end (no end_header); the file is cut off or damaged")
     stop = content.find(b"\n", end)
-    body = content[stop + 1 :] if stop >= 0 else b""
+    body = memoryview(content)[stop + 1 :] if stop >= 0 else memoryview(b"")
     form, elements = "", []
     try:
         for line in content[:end].decode("latin-1").splitlines()[1:]:
@@ -184,7 +186,7 @@ class _AsciiBody:
 
 
 class _BinaryBody:
-    def __init__(self, path: Path, body: bytes, order: str) -> None:
+    def __init__(self, path: Path, body: memoryview, order: str) -> None:
         self.path, self.body, self.order, self.at = path, body, order, 0
 
     @property
@@ -211,7 +213,7 @@ class _BinaryBody:
             table = np.frombuffer(self.body, row, element.count, self.at)
             if all((table[f"{p.name} count"] == 3).all() for p in lists):
                 self.at += row.itemsize * element.count
-                three = np.full(element.count, 3)
+                three = np.broadcast_to(3, element.count)
                 return {
                     p.name: _Polygons(_whole(self.path, table[p.name].ravel()), three) if p.count_kind else table[p.name]
                     for p in element.properties
@@ -245,7 +247,11 @@ def _whole(path: Path, numbers: npt.NDArray[Any]) -> IntArray:
     """Numbers of vertices, whatever type the file gives them. Raises InputError for what no vertex can have."""
     if numbers.dtype.kind == "f" and not (np.abs(numbers) < 2**53).all():
         raise InputError(path, "a face names a vertex by what is no whole number; the file is damaged")
-    return numbers.astype(np.int64)
+    # what always fits is kept narrow: of millions of faces these are the largest array
+    return numbers.astype(
+        np.int32 if numbers.dtype.kind in "iu" and numbers.dtype.itemsize + (numbers.dtype.kind == "u") <= 4 else np.int64,
+        copy=False,
+    )
 
 
 def _columns(path: Path, element: _Element, pieces: dict[str, list[Any]], counts: dict[str, list[int]]) -> dict[str, Any]:

@@ -6,6 +6,7 @@ samples), interpolated (between samples, within a stated distance), invented (no
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -17,6 +18,8 @@ from rangecheck.errors import ArrayError
 from rangecheck.surface.normals import angle_weighted_into, area_vectors_into
 
 MEASURED, INTERPOLATED, INVENTED = 0, 1, 2
+#: of large meshes
+FACES_AT_ONCE = 1 << 20
 ORIGIN_NAMES = ("measured", "interpolated", "invented")
 
 
@@ -92,8 +95,22 @@ class Surface:
     def vertex_normals(self) -> FloatArray:
         """(n, 3) unit normals, faces weighted by their angle at the vertex (Thurmer & Wuthrich 1998)."""
         normals = np.zeros_like(self.vertices)
-        angle_weighted_into(self.vertices, self.faces, self.face_normals, normals)
+        for piece in self.pieces():
+            angle_weighted_into(self.vertices, self.faces[piece], self.normals_of(piece), normals)
         return np.nan_to_num(unit_vectors(normals))
+
+    def pieces(self) -> Iterator[slice]:
+        """All faces, in order, so many at a time that what is made of them on the way stays small."""
+        return (slice(first, first + FACES_AT_ONCE) for first in range(0, len(self.faces), FACES_AT_ONCE))
+
+    def normals_of(self, chosen: slice | IntArray) -> FloatArray:
+        """(k, 3) `face_normals` of some faces; those of all are not kept for it."""
+        if "face_normals" in self.__dict__:
+            return self.face_normals[chosen]
+        faces = self.faces[chosen]
+        vectors = np.empty((len(faces), 3))
+        area_vectors_into(self.vertices, faces, vectors)
+        return unit_vectors(vectors)
 
     @property
     def area_mm2(self) -> float:
@@ -105,8 +122,13 @@ class Surface:
         """Signed volume enclosed by the faces (divergence theorem); meaningful for closed surfaces only."""
         if not len(self.faces):
             return 0.0
-        local = self.triangles - self.vertices.mean(axis=0)
-        return float(np.einsum("ij,ij->i", local[:, 0], np.cross(local[:, 1], local[:, 2])).sum() / 6.0)
+        middle = self.vertices.mean(axis=0)
+
+        def six_volumes(piece: slice) -> float:
+            local = self.vertices[self.faces[piece]] - middle
+            return float(np.einsum("ij,ij->i", local[:, 0], np.cross(local[:, 1], local[:, 2])).sum())
+
+        return sum(map(six_volumes, self.pieces())) / 6.0
 
     @cached_property
     def bounds_mm(self) -> FloatArray:

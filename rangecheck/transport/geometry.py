@@ -36,7 +36,7 @@ def geometry_of(scene: Scene, caster: EmbreeCaster) -> Geometry:
     """The scene's faces in the local frame of `caster`."""
     faces = len(caster.faces)
     return Geometry(
-        corners=np.ascontiguousarray(caster.vertices.astype(np.float32)[caster.faces].reshape(faces, 9)),
+        corners=np.take(caster.vertices.astype(np.float32), caster.faces, axis=0).reshape(faces, 9),
         normals=np.ascontiguousarray(scene.corner_normals.reshape(faces, 9)),
         material=np.ascontiguousarray(scene.material_of_face),
         skin=caster.skin,
