@@ -98,6 +98,7 @@ def render(
         tracer = Tracer(scene_of(subject, material, direct=settings.light.model == "direct"))
         plan = plan_of(tracer, optics.camera, pose, settings)
         film, said = take(tracer, optics, pose, plan, settings.seed)
+        del tracer  # of a large mesh it is far more than the picture
     exposure = settings.picture.exposure or exposure_from([film.radiance])
     write_png(out, developed(image_of(film, optics), exposure, optics, settings.seed), force=force)
     beside = Path(out)

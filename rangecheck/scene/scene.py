@@ -15,6 +15,7 @@ from rangecheck.scene.sources import Source
 from rangecheck.scene.surroundings import DARKNESS, Surroundings
 from rangecheck.surface import Surface
 from rangecheck.surface.normals import corner_normals_into
+from rangecheck.surface.surface import FACES_AT_ONCE
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +106,9 @@ class Scene:
         smooth = np.asarray(self.smooth_of_part or (self.smooth,) * len(self.surface.part_names))[self.surface.part_of_face]
         known = self.vertex_normals
         if known is None:
-            known = self.surface.vertex_normals if smooth.any() else np.zeros((0, 3))
+            large = len(self.surface.faces) > FACES_AT_ONCE
+            of_vertices = self.surface.made_vertex_normals if large else lambda: self.surface.vertex_normals
+            known = of_vertices() if smooth.any() else np.zeros((0, 3))
         if known.ndim == 2:
             for piece in self.surface.pieces():
                 corner_normals_into(

@@ -94,10 +94,16 @@ class Surface:
     @cached_property
     def vertex_normals(self) -> FloatArray:
         """(n, 3) unit normals, faces weighted by their angle at the vertex (Thurmer & Wuthrich 1998)."""
+        return self.made_vertex_normals()
+
+    def made_vertex_normals(self) -> FloatArray:
+        """`vertex_normals`, not kept: for who needs those of a large mesh once."""
         normals = np.zeros_like(self.vertices)
         for piece in self.pieces():
             angle_weighted_into(self.vertices, self.faces[piece], self.normals_of(piece), normals)
-        return np.nan_to_num(unit_vectors(normals))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            normals /= np.sqrt(np.einsum("ij,ij->i", normals, normals))[:, None]
+        return np.nan_to_num(normals, copy=False)
 
     def pieces(self) -> Iterator[slice]:
         """All faces, in order, so many at a time that what is made of them on the way stays small."""
