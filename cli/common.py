@@ -18,6 +18,8 @@ import click
 from rangecheck import progress
 from rangecheck.progress import Reporter
 
+from .memory import bound_memory
+
 if TYPE_CHECKING:
     from rangecheck.pipeline import Outcome
 
@@ -280,19 +282,5 @@ def settings_from(config: str | None, assignments: tuple[str, ...], preset: str 
 
     settings = load_settings(config, assignments, {key.replace("__", "."): value for key, value in overrides.items()}, preset)
     if settings.memory_mb is not None:
-        _bound_memory(int(settings.memory_mb * 1e6))
+        click.get_current_context().call_on_close(bound_memory(settings.memory_mb))
     return settings
-
-
-def _bound_memory(most: int) -> None:
-    """No more than `most` bytes for this process, and for each that it starts, until the command ends. Where the system has no such bound,
-    nothing happens."""
-    try:
-        import resource
-
-        before = resource.getrlimit(resource.RLIMIT_DATA)
-        hardest = before[1] if before[1] != resource.RLIM_INFINITY else most
-        resource.setrlimit(resource.RLIMIT_DATA, (min(most, hardest), before[1]))
-    except (ImportError, ValueError, OSError):
-        return
-    click.get_current_context().call_on_close(lambda: resource.setrlimit(resource.RLIMIT_DATA, before))

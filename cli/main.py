@@ -13,6 +13,8 @@ from typing import Any, NoReturn
 
 import click
 
+from .memory import OUT_OF_MEMORY
+
 #: command -> (module, one line for --help); a test keeps the lines equal to the commands' own
 COMMANDS = {
     "run": "Do the whole job: mesh, check, close, render, measure, export STL, report.",
@@ -102,7 +104,7 @@ def exit_status(arguments: list[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except MemoryError:
-        return _complain("out of memory; try a larger meshing.voxel_mm, smaller pictures, or a higher memory_mb where it was set")
+        return _complain(OUT_OF_MEMORY)
     except Exception as error:
         from rangecheck.errors import PosesRefused, RangecheckError
 

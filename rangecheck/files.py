@@ -20,6 +20,8 @@ from rangecheck.errors import InputError, OutputError
 
 #: the names under which `whole_file` writes
 _PART = re.compile(r"\..+\.[a-z0-9_]{8}\.part(\.[^.]+)?")
+#: what this process is writing
+_under_way: set[Path] = set()
 
 
 @contextmanager
@@ -39,6 +41,7 @@ def whole_file(path: str | Path, *, force: bool = True) -> Iterator[Path]:
     except OSError as error:
         raise OutputError(path, f"cannot be written ({error.strerror}); choose a folder you may write to") from None
     part = Path(name)
+    _under_way.add(part)
     try:
         yield part
         with part.open("rb+") as stream:
@@ -48,6 +51,14 @@ def whole_file(path: str | Path, *, force: bool = True) -> Iterator[Path]:
     except OSError as error:
         raise OutputError(path, f"could not be written ({error.strerror or error}); nothing was left under that name") from None
     finally:
+        _under_way.discard(part)
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+
+
+def drop_parts() -> None:
+    """Remove what this process has begun to write and not finished, before it ends without unwinding."""
+    for part in tuple(_under_way):
         with suppress(OSError):
             part.unlink(missing_ok=True)
 

@@ -93,7 +93,7 @@ def inputs(folder: Path) -> list[str]:
     write_npz(folder / "a.npz", RangeScan(ranges, CAMERA))
     write_scans(folder / "scans", [RangeScan(ranges, CAMERA, name="a")], step_mm=0.02)
     for kind in ("ply", "stl", "obj"):
-        write_mesh(ball(1, 40.0), folder / f"ball.{kind}")
+        write_mesh(ball(1, 40.0), folder / f"ball.{kind}", force_open=True)
     (folder / "half.ply").write_bytes((folder / "ball.ply").read_bytes()[:300])
     (folder / "empty.stl").touch()
     (folder / "settings.toml").write_text("seed = 3\n")
