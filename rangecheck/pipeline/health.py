@@ -76,7 +76,8 @@ def doctor() -> Outcome:
     fit = all(r["state"] == "ok" for r in rows if r["needed"])
     marks = {"ok": "ok     ", "missing": "MISSING", "broken": "BROKEN "}
     lines = [
-        f"{marks[str(r['state'])]} {r['name']!s:<15} {r['detail']}" + (f"\n        mend with: {r['mend']}" if r["mend"] else "")
+        f"{marks[str(r['state'])] if r['needed'] or r['state'] != 'missing' else 'absent '} {r['name']!s:<15} {r['detail']}"
+        + (f"\n        mend with: {r['mend']}" if r["mend"] else "")
         for r in rows
     ]
     lines.append("everything needed is here" if fit else "something that the main job needs is missing")
