@@ -12,18 +12,35 @@ ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text()
 
 
-def test_every_command_in_readme_works(tmp_path, monkeypatch):
+def test_every_command_in_readme_works_and_says_what_stands_below_it(tmp_path, monkeypatch, capsys):
     for folder in ("sample_data", "configs"):
         (tmp_path / folder).symlink_to(ROOT / folder)
     monkeypatch.chdir(tmp_path)
-    blocks = re.findall(r"^```console\n(.*?)^```", README, re.S | re.M)
-    commands = [line[2:] for block in blocks for line in block.splitlines() if line.startswith("$ ")]
-    assert len(commands) > 12
-    for command in commands:
+    blocks = re.findall(r"^```console\n(.*?)^```(?:\n\n```text\n(.*?)^```)?", README, re.S | re.M)
+    commands = [
+        (line[2:], said if line == block.splitlines()[-1] else "")
+        for block, said in blocks
+        for line in block.splitlines()
+        if line.startswith("$ ")
+    ]
+    assert len(commands) > 12 and any(said for _, said in commands)
+    for command, said in commands:
         program, *arguments = shlex.split(command)
         assert program == "rangecheck"
+        capsys.readouterr()
         # a small job's verdict may be that it is not fit; what must not happen is that a command fails
-        assert exit_status([*arguments, "-q"]) in ((0, 1) if arguments[0] in ("run", "check") else (0,)), command
+        status = exit_status(arguments if said else [*arguments, "-q"])
+        assert status in ((0, 1) if arguments[0] in ("run", "check") else (0,)), command
+        told = "".join(capsys.readouterr())
+        for line in said.splitlines():
+            assert re.search(f"^{re.escape(line).replace(re.escape('...'), '.*')}$", told, re.M), line
+
+
+def test_every_target_of_make_in_readme_exists():
+    targets = re.findall(r"^make ([a-z]+)", README, re.M)
+    assert targets
+    for target in targets:
+        assert re.search(f"^{target}:", (ROOT / "Makefile").read_text(), re.M), target
 
 
 def test_every_python_block_in_readme_works(tmp_path, monkeypatch):
