@@ -217,12 +217,30 @@ class ConsoleReporter(Reporter):
         self._task: Any = None
         if verbosity >= 0 and sys.stderr.isatty():
             from rich.console import Console
-            from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+            from rich.progress import (
+                BarColumn,
+                MofNCompleteColumn,
+                Progress,
+                ProgressColumn,
+                Task,
+                TextColumn,
+                TimeElapsedColumn,
+                TimeRemainingColumn,
+            )
+            from rich.text import Text
+
+            class Rate(ProgressColumn):
+                """Steps a second, of stages that have some."""
+
+                def render(self, task: Task) -> Text:
+                    speed = task.finished_speed or task.speed
+                    return Text("" if speed is None or (task.total or 0) < 2 else f"{speed:.3g}/s")
 
             self._bar = Progress(
                 TextColumn("{task.description:<28}"),
                 BarColumn(bar_width=30),
                 MofNCompleteColumn(),
+                Rate(),
                 TimeElapsedColumn(),
                 TimeRemainingColumn(),
                 console=Console(stderr=True),
