@@ -178,8 +178,9 @@ def contour_picture(
     tint = legend.colours_of(depth, high, low, "relief").astype(float)
     if relief:
         shade = np.nan_to_num(relief_shading(depth, pixel), nan=1.0)
-        tint = np.where(np.isfinite(depth)[..., None], tint * (0.45 + 0.6 * shade[..., None]), legend.NOTHING)
-    picture = cv2.resize(np.clip(tint, 0, 255).astype(np.uint8), size, interpolation=cv2.INTER_CUBIC)
+        tint *= (0.45 + 0.6 * shade)[..., None]
+        tint[~np.isfinite(depth)] = legend.NOTHING
+    picture = cv2.resize(np.clip(tint, 0, 255, out=tint).astype(np.uint8), size, interpolation=cv2.INTER_CUBIC)
     thin = max(1, round(max(size) / 900))
     for level, lines in iso_lines(depth, step, JUMP_SLOPE * pixel).items():
         heavy = round(level / step) % INDEX_EVERY == 0
