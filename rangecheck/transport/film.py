@@ -22,7 +22,7 @@ class Film:
     coverage  (h, w) float32, share of the pixel's samples that met a surface
     variance  (h, w, c) float32 of `radiance`, estimated from the spread of the pixel's observations as if they were independent
               (they are spread evenly, so that it is an upper estimate); NaN where a single one was made
-    samples   (h, w) int32 rays per pixel
+    samples   (h, w) int32 rays per pixel, with those that are known to meet nothing and were not cast
     budget    (first reflection, number of reflections, light): radiance summed over samples and wavelengths, divided by pixels x passes
     lights    names of the lights, the surroundings last
     """
