@@ -86,7 +86,7 @@ def render_frames(
     force: bool = False,
     progress: Callable[[int, int], None] | None = None,
     spread: Spread | None = None,
-    abreast: bool = True,
+    abreast: int = 64,
     stands: Callable[[int], None] | None = None,
 ) -> list[Path]:
     """Make frames 0..frames-1 as files in `folder`, or those of them that are missing, and return their paths in order.
@@ -94,8 +94,8 @@ def render_frames(
     frame(index) is the radiance of one frame, a pure function of its number; encode(radiance, exposure, index) is its file. `exposure`
     is a number, or a function of the pilot frames' radiances, asked once before the first frame is written and then kept in the
     manifest. progress(done, frames) is called after each frame, stands(index) for each whose file is whole, at once for those that were
-    there. Frames are made `abreast`, one on each thread, or all threads make one.  An interruption leaves only whole files, and the next call with
-    the same key goes on to the same bytes. With `spread` (see `farm`) frames are made elsewhere, and `frame` is not called here.
+    there. At most `abreast` frames are in the making at once, each on a thread of its own; with 1 all threads make one. An interruption
+    leaves only whole files, and the next call with the same key goes on to the same bytes. With `spread` (see `farm`) frames are made elsewhere, and `frame` is not called here.
 
     Raises OutputError when the folder holds frames of another job, or frames without a manifest, unless `force`, which removes
     them first."""
@@ -107,7 +107,7 @@ def render_frames(
     missing = [i for i, path in enumerate(paths) if not _finished(path, done.get(path.name))]
     if progress is not None:
         progress(frames - len(missing), frames)
-    made = spread if spread is not None else _abreast(frame) if abreast else _one_after_the_other(frame)
+    made = spread if spread is not None else _abreast(frame, abreast) if abreast > 1 else _one_after_the_other(frame)
     if stands is not None:
         for index in sorted(set(range(frames)) - set(missing)):
             stands(index)
@@ -151,7 +151,7 @@ def _one_after_the_other(frame: Callable[[int], FloatArray]) -> Spread:
     return lambda indices: ((index, frame(index)) for index in indices)
 
 
-def _abreast(frame: Callable[[int], FloatArray]) -> Spread:
+def _abreast(frame: Callable[[int], FloatArray], most: int) -> Spread:
     """Frames in order, as many in the making as there are threads, each on one of its own, and one that waits for its turn."""
 
     def one(index: int) -> FloatArray:
@@ -159,7 +159,7 @@ def _abreast(frame: Callable[[int], FloatArray]) -> Spread:
             return frame(index)
 
     def frames(indices: Sequence[int]) -> Iterator[tuple[int, FloatArray]]:
-        threads = min(thread_count(), len(indices))
+        threads = min(thread_count(), len(indices), most)
         if threads <= 1:
             yield from _one_after_the_other(frame)(indices)
             return

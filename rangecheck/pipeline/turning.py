@@ -43,8 +43,8 @@ from rangecheck.transport import Plan, Tracer
 
 Show = Literal["picture", "stripes", "distance", "id"]
 
-#: pixels of a frame up to which every thread makes one of its own: of larger ones, several at once would need gigabytes
-_ABREAST_PIXELS = 1 << 22
+#: pixels of all frames that are in the making at once, each on a thread of its own: more would need gigabytes
+_ABREAST_PIXELS = 1 << 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,7 +273,7 @@ def _make(
             force=force,
             progress=lambda done, _: reporter.advance(done),
             spread=spread,
-            abreast=job.optics.camera.width * job.optics.camera.height <= _ABREAST_PIXELS,
+            abreast=max(1, _ABREAST_PIXELS // (job.optics.camera.width * job.optics.camera.height)),
             stands=stands,
         )
 
