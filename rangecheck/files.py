@@ -25,8 +25,9 @@ _under_way: set[Path] = set()
 
 
 @contextmanager
-def whole_file(path: str | Path, *, force: bool = True) -> Iterator[Path]:
-    """A temporary path beside `path`, with the same ending, that becomes `path` when the block ends without an error.
+def whole_file(path: str | Path, *, force: bool = True, durable: bool = True) -> Iterator[Path]:
+    """A temporary path beside `path`, with the same ending, that becomes `path` when the block ends without an error. `durable`: it is on the
+    disk then, and outlives a loss of power; else only the end of this process.
 
     Raises OutputError when the folder cannot be written, or when `path` exists and `force` is False."""
     path = Path(path)
@@ -44,8 +45,9 @@ def whole_file(path: str | Path, *, force: bool = True) -> Iterator[Path]:
     _under_way.add(part)
     try:
         yield part
-        with part.open("rb+") as stream:
-            os.fsync(stream.fileno())
+        if durable:
+            with part.open("rb+") as stream:
+                os.fsync(stream.fileno())
         part.chmod(0o666 & ~_umask())
         part.replace(path)
     except OSError as error:
@@ -81,15 +83,17 @@ def _umask() -> int:
     return mask
 
 
-def write_bytes(path: str | Path, content: bytes, *, force: bool = True) -> None:
-    """Write `content` whole or not at all."""
-    with whole_file(path, force=force) as part:
+def write_bytes(path: str | Path, content: bytes, *, force: bool = True, durable: bool = True) -> None:
+    """Write `content` whole or not at all; `durable` as of `whole_file`."""
+    with whole_file(path, force=force, durable=durable) as part:
         part.write_bytes(content)
 
 
-def write_json(path: str | Path, document: Any, *, force: bool = True) -> None:
+def write_json(path: str | Path, document: Any, *, force: bool = True, durable: bool = True) -> None:
     """Write `document` as indented JSON, whole or not at all. NaN is refused: JSON has none."""
-    write_bytes(path, (json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n").encode(), force=force)
+    write_bytes(
+        path, (json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n").encode(), force=force, durable=durable
+    )
 
 
 def read_json(path: str | Path) -> Any:

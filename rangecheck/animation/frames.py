@@ -122,9 +122,10 @@ def render_frames(
 
     def write(index: int, radiance: FloatArray) -> None:
         content = encode(radiance, level, index)
-        write_bytes(paths[index], content)
+        # a frame that a loss of power damages has another hash, and is made again: nobody need wait for the disk
+        write_bytes(paths[index], content, durable=False)
         done[paths[index].name] = hashlib.sha256(content).hexdigest()
-        write_json(where / MANIFEST, manifest | {"done": dict(sorted(done.items()))})
+        write_json(where / MANIFEST, manifest | {"done": dict(sorted(done.items()))}, durable=len(done) in (1, frames))
         if stands is not None:
             stands(index)
 
@@ -152,7 +153,7 @@ def _one_after_the_other(frame: Callable[[int], FloatArray]) -> Spread:
 
 
 def _abreast(frame: Callable[[int], FloatArray], most: int) -> Spread:
-    """Frames in order, as many in the making as there are threads, each on one of its own, and one that waits for its turn."""
+    """Frames in order, as many in the making as there are threads, each on one of its own, and as many that wait for their turn."""
 
     def one(index: int) -> FloatArray:
         with alone():
@@ -167,7 +168,7 @@ def _abreast(frame: Callable[[int], FloatArray], most: int) -> Spread:
             making: deque[tuple[int, Future[FloatArray]]] = deque()
             try:
                 for index in indices:
-                    if len(making) > threads:
+                    if len(making) >= 2 * threads:
                         done, result = making.popleft()
                         yield done, result.result()
                     making.append((index, pool.submit(one, index)))
