@@ -3,7 +3,8 @@
 The windows of `local_fit` in pixels. Noise: neighbours' fits are blended between cells and share most of their samples; and a width at
 which noise stopped the growing windows errs more than its noise gain says, by as much as the same choice among fits of pure noise shows.
 Detail: the error of a local quadratic grows with the fourth power of its width, so the step from one width to the next, less what noise
-makes of it and pooled over a neighbourhood, gives what is left at either (Richardson's extrapolation).
+makes of it and pooled over a neighbourhood, gives what is left at either (Richardson's extrapolation). Where detail is as fine as the
+cells that law says too little: `shared_detail` holds it, and how the samples scatter, against what several scans share.
 """
 
 from __future__ import annotations
@@ -118,16 +119,39 @@ def _pooled(steps: FloatArray, cells: int) -> FloatArray:
     return pooled
 
 
-def smoothed_away(steps: FloatArray, noise: FloatArray, chosen: IntArray) -> FloatArray:
-    """(h, w) mm that the chosen width smooths away: the signed root of a mean square, which is negative where noise says less than nothing.
+@lru_cache(maxsize=1)
+def middle_weights() -> FloatArray:
+    """(scales,) weight of the middle sample in the value of each full window."""
+    weights, reaches, _ = quadratic_windows()
+    return np.array([weights[scale, 0, r, r] for scale, r in enumerate(reaches)])
 
-    steps (h / 2, w / 2, scales - 1) squares of the steps between widths less their noise's; noise the same shape, what was taken off."""
+
+@lru_cache(maxsize=1)
+def noise_of_steps() -> FloatArray:
+    """(scales,) variance, in noises squared, of the step from the sample itself to the narrowest window, and from each to the next."""
+    weights = value_weights()
+    sample = np.zeros((1, weights.shape[1]))
+    sample[0, weights.shape[1] // 2] = 1.0
+    steps: FloatArray = (np.diff(np.concatenate([sample, weights]), axis=0) ** 2).sum(axis=1)
+    return steps
+
+
+def smoothed_away(steps: FloatArray, noise: FloatArray, chosen: IntArray, clues: FloatArray) -> None:
+    """Fill `clues` (h, w, 3), mm^2, below 0 where noise says less than nothing: what the chosen width smooths away by the fourth-power
+    law, and by how much the samples near the cell and around it scatter about the narrowest fit without them, beyond noise.
+
+    steps (h / 2, w / 2, scales) squares of the steps between widths less their noise's; noise the same shape, what was taken off."""
     near, around = _pooled(steps, NEAR_CELLS), _pooled(steps, POOL_CELLS)
     squares = np.where(near > CLEAR * noise, near, around)
     fourth = np.array(WIDTHS_PX) ** 4
     share = np.array([fourth[0] / (fourth[1] - fourth[0]), *(fourth[1:] / (fourth[1:] - fourth[:-1]))]) ** 2
-    step = np.maximum(np.arange(len(fourth)) - 1, 0)
+    step = np.maximum(np.arange(len(fourth)), 1)
     scale = np.where(chosen < 0, 0, chosen % STOPPED)
-    full = squares.repeat(2, axis=0)[: chosen.shape[0]].repeat(2, axis=1)[:, : chosen.shape[1]]
-    mean_square = np.take_along_axis(full, step[scale][..., None], axis=2)[..., 0] * share[scale]
-    return (np.sign(mean_square) * np.sqrt(np.abs(mean_square))).astype(np.float32)
+    left_out = 1.0 / (1.0 - middle_weights()[0]) ** 2
+
+    def full(values: FloatArray) -> FloatArray:
+        whole: FloatArray = values.repeat(2, axis=0)[: chosen.shape[0]].repeat(2, axis=1)[:, : chosen.shape[1]]
+        return whole
+
+    clues[..., 0] = np.take_along_axis(full(squares), step[scale][..., None], axis=2)[..., 0] * share[scale]
+    clues[..., 1], clues[..., 2] = full(near[..., 0]) * left_out, full(around[..., 0]) * left_out

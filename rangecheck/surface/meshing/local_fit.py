@@ -17,7 +17,14 @@ import numpy as np
 
 from rangecheck.arrays import FloatArray
 from rangecheck.kernels import in_chunks, inline_kernel, kernel
-from rangecheck.surface.meshing.fit_error import STOPPED, noise_of_fits, quadratic_windows, smoothed_away, value_weights
+from rangecheck.surface.meshing.fit_error import (
+    STOPPED,
+    middle_weights,
+    noise_of_fits,
+    noise_of_steps,
+    quadratic_windows,
+    smoothed_away,
+)
 
 #: half length of a confidence interval in standard errors: short, since what noise is left is averaged over several scans
 CONFIDENCE = 0.7
@@ -32,6 +39,8 @@ EDGE_WIDTHS_PX = np.array([0.8])
 #: prior of the curvature at the edges: one standard deviation is a pitch / sqrt(RIDGE) per squared cell
 RIDGE = 2.0
 ROWS = 16
+#: numbers per cell of what `quiet_ranges` returns
+FIELDS = 10
 Offsets = tuple[FloatArray | None, FloatArray | None]
 
 
@@ -200,8 +209,8 @@ def _fits(
     steps,
 ):
     """out (h, w, 4): range, slopes, noise gain times noise in mm of each cell, NaN where a cell has too few neighbours of its own surface;
-    chosen (h, w): number of the window, -1 at edges, plus STOPPED where the next one was whole and disagreed; steps (h, w, scales - 1): square of the step from each width to the next, less what
-    noise makes of it, at every second cell and as far as windows are whole (NaN elsewhere)."""
+    chosen (h, w): number of the window, -1 at edges, plus STOPPED where the next one was whole and disagreed; steps (h / 2, w / 2, scales): square of the step from
+    the sample to the narrowest width and from each width to the next, less what noise makes of it, as far as windows are whole (NaN elsewhere)."""
     height, width = ranges.shape
     scales = len(reaches)
     a, b, unit, edge = np.zeros((6, 6)), np.zeros(6), np.zeros(6), np.zeros(4)
@@ -239,8 +248,8 @@ def _fits(
                         break
                 if not whole:
                     break
-                if told and scale > 0:
-                    steps[row // 2, col // 2, scale - 1] = (value - narrower) ** 2 - apart[scale - 1] * sigma * sigma
+                if told:
+                    steps[row // 2, col // 2, scale] = (value - narrower) ** 2 - apart[scale] * sigma * sigma
                 narrower = value
                 half = confidence * gains[scale] * sigma
                 low, high = max(low, value - half), min(high, value + half)
@@ -296,8 +305,9 @@ def quiet_ranges(
 
     ranges (h, w) float64 mm, NaN where nothing returned; pitch (2,): mm per pixel is pitch[0] * range + pitch[1]; off: how far
     the samples lie off their cells' centres, in pixels along u and v, (h, w) each: they are moved there along the local plane.
-    Returns (h, w, 6) float32: range, u slope, v slope, noise gain times noise in mm, standard error by noise in mm of what is read between cells, and root mean
-    square of what the fit smooths away in mm; and (h, w) float32 standard deviation of one range."""
+    Returns (h, w, FIELDS) float32: range, u slope, v slope, noise gain times noise in mm, standard error by noise in mm of what is read
+    between cells, the clues of `shared_detail` in mm^2 (3), what is left of the range beside its fit without it in mm (NaN at edges), and
+    the number of the window (-1 at edges); and (h, w) float32 standard deviation of one range."""
     height, width = ranges.shape
     finite = np.isfinite(ranges)
     slope_u, slope_v, rough = (np.empty((height, width), np.float32) for _ in range(3))
@@ -313,11 +323,11 @@ def quiet_ranges(
     centres = 0.5 * (COSINE_CLASSES[1:] + COSINE_CLASSES[:-1])
     sigma = np.interp(np.nan_to_num(cosine), centres, classes).astype(np.float32)
     sigma = np.maximum(sigma, np.float32(1e-3) * lateral.astype(np.float32))
-    out = np.empty((height, width, 6), np.float32)
+    out = np.empty((height, width, FIELDS), np.float32)
     windows, reaches, gains = quadratic_windows()
-    apart = (np.diff(value_weights(), axis=0) ** 2).sum(axis=1)
+    apart = noise_of_steps()
     chosen = np.empty((height, width), np.int8)
-    steps = np.empty((-(-height // 2), -(-width // 2), len(gains) - 1), np.float32)
+    steps = np.empty((-(-height // 2), -(-width // 2), len(gains)), np.float32)
     in_chunks(
         lambda i, j: _fits(
             ranges,
@@ -341,5 +351,8 @@ def quiet_ranges(
         ROWS,
     )
     out[..., 4] = noise_of_fits(out[..., 3], sigma, chosen, confidence)
-    out[..., 5] = smoothed_away(steps, apart * sigma[::2, ::2, None] ** 2, chosen)
+    smoothed_away(steps, apart * sigma[::2, ::2, None] ** 2, chosen, out[..., 5:8])
+    left_out = 1.0 / (1.0 - np.append(middle_weights(), np.nan)).astype(np.float32)
+    out[..., 9] = window = np.where(chosen < 0, -1, chosen % STOPPED)
+    out[..., 8] = (ranges - out[..., 0]) * left_out[window]
     return out, sigma

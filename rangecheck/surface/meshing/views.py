@@ -22,6 +22,7 @@ from rangecheck.optics import Camera
 from rangecheck.scan import RangeScan
 from rangecheck.surface.meshing.local_fit import BEND_TAN, quiet_ranges
 from rangecheck.surface.meshing.projection import project, projection_of
+from rangecheck.surface.meshing.shared_detail import CLUES, detail_lost
 
 #: numbers per cell: range, half u slope, half v slope, weight, normal x y z, |ray . normal|, variance along the normal by noise, and
 #: mean square of what the fit smooths away
@@ -68,15 +69,16 @@ class Views:
 
 
 @kernel
-def _records(fit, origins, directions, rotation, edge, pitch, first, last, cells):
-    """Fill the records of rows first..last from the local fits."""
+def _records(fit, origins, directions, rotation, edge, pitch, first, last, cells, clues, residual):
+    """Fill the records, clues and residuals of rows first..last from the local fits."""
     height, width = fit.shape[0], fit.shape[1]
     for row in range(first, last):
         r0, r1 = max(row - 1, 0), min(row + 1, height - 1)
         for col in range(width):
             i = row * width + col
             cells[i, :] = 0.0
-            cells[i, 0] = np.nan
+            cells[i, 0] = residual[i] = np.nan
+            clues[i, :] = 0.0
             r = float(fit[row, col, 0])
             if not math.isfinite(r):
                 continue
@@ -110,9 +112,10 @@ def _records(fit, origins, directions, rotation, edge, pitch, first, last, cells
             cells[i, 4] = rotation[0, 0] * nx + rotation[0, 1] * ny + rotation[0, 2] * nz
             cells[i, 5] = rotation[1, 0] * nx + rotation[1, 1] * ny + rotation[1, 2] * nz
             cells[i, 6] = rotation[2, 0] * nx + rotation[2, 1] * ny + rotation[2, 2] * nz
-            noise, smoothed = float(fit[row, col, 4]) * cosine, float(fit[row, col, 5]) * cosine
-            cells[i, 7], cells[i, 8] = cosine, noise * noise + aside * aside * max(1.0 - cosine * cosine, 0.0)
-            cells[i, 9] = smoothed * abs(smoothed)
+            cells[i, 7], cells[i, 8] = cosine, (float(fit[row, col, 4]) * cosine) ** 2
+            for k in range(CLUES):
+                clues[i, k] = fit[row, col, 5 + k] * cosine * cosine
+            residual[i] = fit[row, col, 8] * cosine
 
 
 @kernel
@@ -180,8 +183,23 @@ def _run(mask: BoolArray, axis: int, combine: np.ufunc) -> BoolArray:
     return np.moveaxis(out, 0, axis)
 
 
-def _cells_of(scan: RangeScan, pose: FloatArray, known: dict[Camera, tuple[FloatArray, FloatArray]]):
-    """Kind, numbers (37,), records (h w, 10), noise (h w,) and lateral pitch at each record of one scan at `pose` (4, 4)."""
+@dataclass(frozen=True)
+class _Prepared:
+    """One scan: kind, numbers (37,), records (h w, 10), and (h w,) each noise and lateral pitch, along the normal what is left of the sample
+    beside its fit, its clues (h w, CLUES), and whether a window wider than the narrowest was chosen."""
+
+    kind: int
+    numbers: FloatArray
+    cells: FloatArray
+    noise_mm: FloatArray
+    lateral_mm: FloatArray
+    residual: FloatArray
+    clues: FloatArray
+    wide: BoolArray
+
+
+def _cells_of(scan: RangeScan, pose: FloatArray, known: dict[Camera, tuple[FloatArray, FloatArray]]) -> _Prepared:
+    """One scan at `pose` (4, 4)."""
     seen = projection_of(scan, known.get(scan.camera))
     known.clear()
     known[scan.camera] = seen.origins, seen.directions
@@ -190,15 +208,19 @@ def _cells_of(scan: RangeScan, pose: FloatArray, known: dict[Camera, tuple[Float
     height, width = noise.shape
     edge = np.empty((height, width), np.float32)
     _cells_from_edge(fit, seen.pitch, edge)
-    cells = np.empty((height * width, FIELDS), np.float32)
+    cells, clues = np.empty((height * width, FIELDS), np.float32), np.empty((height * width, CLUES), np.float32)
+    residual = np.empty(height * width, np.float32)
     rotation = np.ascontiguousarray(pose[:3, :3])
     in_chunks(
-        lambda i, j: _records(fit, seen.origins, seen.directions, rotation, edge, seen.pitch, i, j, cells),
+        lambda i, j: _records(fit, seen.origins, seen.directions, rotation, edge, seen.pitch, i, j, cells, clues, residual),
         height,
         32,
     )
     numbers = np.concatenate([back[:3, :3].ravel(), back[:3, 3], seen.numbers])
-    return seen.kind, numbers, cells, noise.ravel(), seen.pitch[0] * cells[:, RANGE] + seen.pitch[1]
+    wide = (fit[..., 9] > 0).ravel()
+    return _Prepared(
+        seen.kind, numbers, cells, noise.ravel(), seen.pitch[0] * cells[:, RANGE] + seen.pitch[1], residual, clues, wide
+    )
 
 
 def views_of(scans: Sequence[RangeScan]) -> Views:
@@ -213,26 +235,34 @@ def views_of(scans: Sequence[RangeScan]) -> Views:
     for pose in poses:
         pose[:3, 3] -= shift
     parts = [_cells_of(scan, pose, known) for scan, pose in zip(scans, poses)]
-    spacings = []
-    for scan, (kind, numbers, cells, _, lateral) in zip(scans, parts):
-        good = cells[:, WEIGHT] > 0
-        spacings.append(lateral[good] / np.sqrt(cells[good, COSINE]))
-        hit = scan.valid.copy()
-        _mark_hit(kind, numbers, *hit.shape, points, 2, hit)
-        # a ray that returned nothing, and on which no other scan saw anything, ran through empty space
-        cells[~_closed_up(hit).ravel(), RANGE] = np.inf
+    spacings, own = [], []
+    starts = np.cumsum([0] + [len(part.cells) for part in parts[:-1]]).astype(np.int64)
+    for scan, part, start in zip(scans, parts, starts):
+        good = part.cells[:, WEIGHT] > 0
+        spacings.append(part.lateral_mm[good] / np.sqrt(part.cells[good, COSINE]))
+        own.append(start + np.flatnonzero(scan.valid))
     spacing = np.concatenate(spacings)
     if len(spacing) == 0:
         raise ScanError("the scans' samples lie too far apart to span a surface; check the unit, or use poisson or pivot")
-    starts = np.cumsum([0] + [len(part[2]) for part in parts[:-1]])
-    return Views(
-        kind=np.array([part[0] for part in parts], np.int64),
-        numbers=np.array([part[1] for part in parts]),
+    views = Views(
+        kind=np.array([part.kind for part in parts], np.int64),
+        numbers=np.array([part.numbers for part in parts]),
         size=np.array([scan.range_mm.shape for scan in scans], np.int64),
-        start=starts.astype(np.int64),
-        cells=np.concatenate([part[2] for part in parts]),
-        noise_mm=np.concatenate([part[3] for part in parts]),
+        start=starts,
+        cells=np.concatenate([part.cells for part in parts]),
+        noise_mm=np.concatenate([part.noise_mm for part in parts]),
         samples_mm=points,
         spacing_mm=float(np.median(spacing)),
         shift_mm=shift,
     )
+    residual, clues, wide = (np.concatenate([getattr(part, name) for part in parts]) for name in ("residual", "clues", "wide"))
+    del parts
+    views.cells[:, SMOOTHED] = detail_lost(
+        views.arrays, residual, clues, wide, views.noise_mm, points, np.concatenate(own), views.spacing_mm
+    )
+    for s, scan in enumerate(scans):
+        hit = scan.valid.copy()
+        _mark_hit(views.kind[s], views.numbers[s], *hit.shape, points, 2, hit)
+        # a ray that returned nothing, and on which no other scan saw anything, ran through empty space
+        views.cells[starts[s] : starts[s] + hit.size, RANGE][~_closed_up(hit).ravel()] = np.inf
+    return views
