@@ -5,8 +5,7 @@ import pytest
 
 from rangecheck import rigid
 from rangecheck.config import load_settings
-from rangecheck.export.meshes import write_mesh
-from rangecheck.pipeline.job_study import _labelled, error_of
+from rangecheck.pipeline.job_study import error_of
 from rangecheck.pipeline.presets import PRESETS, finer_than, measured
 from rangecheck.scan.sample import sample_view
 from rangecheck.surface import INVENTED, MEASURED, Surface
@@ -40,17 +39,6 @@ def test_what_was_invented_does_not_count(truth):
     far = (half[faces] != points[faces]).any(axis=(1, 2))
     surface = Surface(half, faces, origin_of_face=np.where(far, INVENTED, MEASURED).astype(np.uint8))
     assert error_of(surface).p99 < 0.2
-
-
-def test_what_a_job_wrote_is_read_with_its_labels(truth, tmp_path):
-    points, _, faces = truth
-    origin = (np.arange(len(faces)) % 3).astype(np.uint8)
-    part = (np.arange(len(faces)) % 2).astype(np.int32)
-    write_mesh(Surface(points, faces, part, origin, ("surface", "base")), tmp_path / "surface.ply")
-    found = _labelled(tmp_path / "surface.ply")
-    assert found.part_names == ("surface", "base")
-    np.testing.assert_array_equal(found.origin_of_face, origin)
-    np.testing.assert_array_equal(found.part_of_face, part)
 
 
 def test_every_preset_has_its_measured_figures_and_says_what_the_next_one_gains():

@@ -7,6 +7,8 @@ import pytest
 from test_topology_distance import CUBE_CORNERS, CUBE_FACES, cube
 
 from rangecheck.errors import InputError, UnitMissing
+from rangecheck.export.meshes import write_mesh
+from rangecheck.surface import Surface
 from rangecheck.surface import topology as topo
 from rangecheck.surface.mesh_files import open_mesh, read_mesh
 from rangecheck.surface.weld import weld_exactly
@@ -89,6 +91,23 @@ def test_every_kind_of_file_gives_the_same_cube(tmp_path, name):
         read_mesh(tmp_path / name)
 
 
+def test_our_own_ply_says_its_unit_and_keeps_its_labels(tmp_path):
+    box = cube(2.0)
+    origin, part = (np.arange(12) % 3).astype(np.uint8), (np.arange(12) % 2).astype(np.int32)
+    error = np.linspace(0.1, 0.8, 8)
+    write_mesh(Surface(box.vertices, box.faces, part, origin, ('a "first"', "base"), error), tmp_path / "box.ply")
+    found = open_mesh(tmp_path / "box.ply")
+    assert found.unit == "mm" and found.surface.part_names == ('a "first"', "base")
+    np.testing.assert_array_equal(found.surface.origin_of_face, origin)
+    np.testing.assert_array_equal(found.surface.part_of_face, part)
+    np.testing.assert_allclose(found.surface.vertex_error_mm, error, rtol=1e-6)
+    # a unit that is asked for goes first; labels that contradict their legend are none
+    assert open_mesh(tmp_path / "box.ply", "cm").surface.volume_mm3 == pytest.approx(8000)
+    content = (tmp_path / "box.ply").read_bytes()
+    (tmp_path / "one.ply").write_bytes(content.replace(b'comment part 1 "base"\n', b""))
+    assert read_mesh(tmp_path / "one.ply").part_names == ("one",)
+
+
 @pytest.mark.parametrize(("kind", "volume_mm3"), [("glb", 8e9), ("3mf", 8.0)])
 def test_glb_is_in_metres_and_3mf_says_its_unit(tmp_path, kind, volume_mm3):
     import trimesh
@@ -156,6 +175,15 @@ def test_a_broken_file_is_refused_in_one_line_that_names_it(tmp_path, name):
     with pytest.raises(InputError) as refusal:
         read_mesh(tmp_path / name, "mm")
     assert words in str(refusal.value) and name in str(refusal.value) and "\n" not in str(refusal.value)
+
+
+def test_coordinates_beyond_reckoning_are_refused(tmp_path):
+    write_mesh(cube(2.0), tmp_path / "box.ply")
+    read = (tmp_path / "box.ply").read_bytes()
+    far = read.replace(np.array([1.0]).tobytes(), np.array([1e200]).tobytes())
+    (tmp_path / "far.ply").write_bytes(far)
+    with pytest.raises(InputError, match=r"coordinates up to 1e\+200 mm, beyond"):
+        read_mesh(tmp_path / "far.ply")
 
 
 def test_a_missing_file_is_named(tmp_path):

@@ -26,6 +26,7 @@ from rangecheck.progress import Reporter
 from rangecheck.scan.sample import make_sample_data
 from rangecheck.study import Measurement, Part, SpeedChart, peak_memory_mb, study_of_parts
 from rangecheck.surface import MEASURED, Surface
+from rangecheck.surface.mesh_files import read_mesh
 
 #: fusion cells in sample spacings
 CELLS = (4.0, 3.0, 2.0, 1.5, 1.0, 0.8)
@@ -108,7 +109,7 @@ def _whole(preset: str) -> Callable[[bool], Part]:
             began = time.perf_counter()
             done = run([str(scans)], str(out), settings=settings, unit=None, force=False, reporter=reporter)
             took = time.perf_counter() - began
-            found = error_of(_labelled(out / "surface.ply"))
+            found = error_of(read_mesh(out / "surface.ply"))
         row = {
             "preset": preset, "seconds": took, "fit": done.fit, "faces": done.document["faces"], "rms_mm": found.rms,
             "p99_mm": found.p99, "peak_memory_mb": peak_memory_mb(), "stages": dict(reporter.seconds),
@@ -120,17 +121,6 @@ def _whole(preset: str) -> Callable[[bool], Part]:
         return Part((), [said], {preset: [row]})
 
     return part
-
-
-def _labelled(path: Path) -> Surface:
-    """A surface that a job wrote, with the labels of its faces."""
-    import trimesh
-
-    mesh = trimesh.load(path, process=False)
-    labels = mesh.metadata["_ply_raw"]["face"]["data"]
-    header = path.read_bytes().split(b"end_header", 1)[0].decode()
-    names = tuple(line.split('"')[1] for line in header.splitlines() if line.startswith("comment part "))
-    return Surface(mesh.vertices, mesh.faces, np.asarray(labels["part"]), np.asarray(labels["origin"]), names)
 
 
 PARTS = {"cells": _cells} | {preset: _whole(preset) for preset in PRESETS}

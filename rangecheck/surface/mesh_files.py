@@ -1,8 +1,8 @@
 """Reading mesh files as surfaces in millimetres: STL, PLY, OBJ, OFF by own readers, GLB and 3MF through trimesh.
 
-STL, PLY, OBJ and OFF do not say their unit, so it is asked for; GLB is metres by its specification, 3MF says. Vertices that faces name
-are welded where their coordinates are equal bit for bit, as STL, which has no indices, would weld them; nothing is merged by nearness,
-dropped or turned.
+STL, OBJ, OFF and the PLY of others do not say their unit, so it is asked for; GLB is metres by its specification, 3MF and rangecheck's own
+PLY say. Vertices that faces name are welded where their coordinates are equal bit for bit, as STL, which has no indices, would weld them;
+nothing is merged by nearness, dropped or turned. The labels of rangecheck's own PLY stay with its faces.
 """
 
 from __future__ import annotations
@@ -17,13 +17,15 @@ import numpy as np
 from rangecheck.arrays import FloatArray, IntArray, mm_per
 from rangecheck.errors import DependencyMissing, InputError, UnitMissing
 from rangecheck.files import read_bytes
-from rangecheck.surface.ply_files import ply_mesh
+from rangecheck.surface.ply_files import Labels, ply_mesh
 from rangecheck.surface.standing import lowered_in, turned_back
 from rangecheck.surface.stl_files import stl_corners
 from rangecheck.surface.surface import Surface
 from rangecheck.surface.weld import weld_exactly
 
 FORMATS = ("stl", "ply", "obj", "off", "glb", "3mf")
+#: float32, in which STL is written and rays are traced, holds squares of lengths up to 1.8e19 mm
+LARGEST_MM = 1e18
 #: 3MF's names of units
 _UNITS_3MF = {"micron": "um", "millimeter": "mm", "centimeter": "cm", "meter": "m", "inch": "in"}
 
@@ -56,6 +58,7 @@ def open_mesh(path: str | Path, unit: str | None = None) -> MeshFile:
     records = False
     vertices: FloatArray
     faces: IntArray
+    labels: Labels | None = None
     if kind == "stl":
         corners, notes, records = stl_corners(path, content)
         _finite(path, corners.reshape(-1, 3), 3)
@@ -63,7 +66,8 @@ def open_mesh(path: str | Path, unit: str | None = None) -> MeshFile:
         vertices, faces = corners.reshape(-1, 3)[first].astype(np.float64), number.reshape(-1, 3)
         notes.append(f"{len(number)} corners were welded to {len(first)} vertices where their float32 coordinates are equal")
     elif kind == "ply":
-        vertices, faces, notes = ply_mesh(path, content)
+        vertices, faces, notes, said, labels = ply_mesh(path, content)
+        unit = unit or said
     elif kind == "obj":
         vertices, faces = _obj(path, content)
     elif kind == "off":
@@ -81,7 +85,16 @@ def open_mesh(path: str | Path, unit: str | None = None) -> MeshFile:
     if unit is None:
         raise UnitMissing(path)
     if kind != "stl":
+        before = len(vertices)
         vertices, faces = _welded(vertices, faces, notes)
+        if labels is not None and len(vertices) < before:
+            labels = labels._replace(error_mm=None)
+    farthest = float(np.abs(vertices).max()) * mm_per(unit)
+    if farthest > LARGEST_MM:
+        raise InputError(
+            path,
+            f"has coordinates up to {farthest:.3g} mm, beyond the {LARGEST_MM:g} mm that can be reckoned with; say its unit with --unit",
+        )
     own = vertices
     lowered = lowered_in(_head(content, kind))
     del content
@@ -89,7 +102,12 @@ def open_mesh(path: str | Path, unit: str | None = None) -> MeshFile:
         vertices = turned_back(vertices, lowered)
         notes.append("it stands with z up, as slicers take it; read in the frame of its scans, y up")
     in_mm = vertices if mm_per(unit) == 1.0 else vertices * mm_per(unit)
-    return MeshFile(Surface(in_mm, faces, part_names=(path.stem,)), kind, unit, tuple(notes), own, records)
+    if labels is None:
+        surface = Surface(in_mm, faces, part_names=(path.stem,))
+    else:
+        error = None if labels.error_mm is None else labels.error_mm * mm_per(unit)
+        surface = Surface(in_mm, faces, labels.part, labels.origin, labels.names, error)
+    return MeshFile(surface, kind, unit, tuple(notes), own, records)
 
 
 def _head(content: bytes, kind: str) -> bytes:

@@ -1,20 +1,23 @@
 """Reading PLY meshes: ASCII, binary of both byte orders, polygons of any size, properties in any order.
 
-Turk, *The PLY polygon file format*, 1994. Only `vertex` x y z and `face` vertex_indices (or vertex_index) are used; other elements
-and properties are stepped over. Nothing is allocated that the file's size does not warrant.
+Turk, *The PLY polygon file format*, 1994. Only `vertex` x y z and `face` vertex_indices (or vertex_index) are used, and what rangecheck's own
+PLY says in comments and properties: the unit, the part and the origin of each face, the error of each vertex; other elements and properties
+are stepped over. Nothing is allocated that the file's size does not warrant.
 """
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from rangecheck.arrays import FloatArray, IntArray
+from rangecheck.arrays import MM_PER_UNIT, FloatArray, IntArray
 from rangecheck.errors import InputError
+from rangecheck.surface.surface import ORIGIN_NAMES
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
@@ -44,9 +47,28 @@ class _Polygons:
         self.corners, self.counts = corners, counts
 
 
-def ply_mesh(path: Path, content: bytes) -> tuple[FloatArray, IntArray, list[str]]:
-    """Vertices (n, 3) float64 as the file gives them, triangles (m, 3), and what was odd. Raises InputError."""
-    form, elements, body = _header(path, content)
+class Labels(NamedTuple):
+    """What a PLY of rangecheck says of its faces, part (m,) with their names and origin (m,), and of its vertices: error_mm (n,) or None."""
+
+    part: IntArray
+    names: tuple[str, ...]
+    origin: IntArray
+    error_mm: FloatArray | None
+
+
+class PlyMesh(NamedTuple):
+    """vertices (n, 3) float64 as the file gives them, triangles (m, 3), what was odd, the unit and the labels or None."""
+
+    vertices: FloatArray
+    faces: IntArray
+    notes: list[str]
+    unit: str | None
+    labels: Labels | None
+
+
+def ply_mesh(path: Path, content: bytes) -> PlyMesh:
+    """The mesh in the bytes of a PLY file. Raises InputError."""
+    form, elements, body, comments = _header(path, content)
     names = [e.name for e in elements]
     if "vertex" not in names:
         raise InputError(path, "has no vertices; export it again")
@@ -55,30 +77,56 @@ def ply_mesh(path: Path, content: bytes) -> tuple[FloatArray, IntArray, list[str
         raise InputError(path, f"holds {what}; mesh it first (rangecheck mesh)")
     reader = _AsciiBody(path, bytes(body)) if form == "ascii" else _BinaryBody(path, body, "<" if "little" in form else ">")
     vertices = faces = None
+    of_vertex: dict[str, Any] = {}
+    of_face: dict[str, Any] = {}
     for element in elements:
         columns = reader.element(element)
         if element.name == "vertex":
             missing = [axis for axis in "xyz" if axis not in columns]
             if missing:
                 raise InputError(path, f"its vertices have no {', '.join(missing)}; export it again")
-            vertices = np.empty((element.count, 3))
+            vertices, of_vertex = np.empty((element.count, 3)), columns
             for k, axis in enumerate("xyz"):
                 vertices[:, k] = columns[axis]
         elif element.name == "face":
             name = next((n for n in _LIST_NAMES if n in columns), None)
             if name is None:
                 raise InputError(path, "its faces have no vertex_indices; export it again")
-            faces = columns[name]
+            faces, of_face = columns[name], columns
         if vertices is not None and faces is not None:
             break
     assert vertices is not None and faces is not None
     notes = (
         [f"{reader.left} bytes follow the last element; they were left out"] if reader.left and element is elements[-1] else []
     )
-    return vertices, _triangles(faces, notes), notes
+    labels = _labels(comments, of_vertex, of_face) if (faces.counts == 3).all() else None
+    return PlyMesh(vertices, _triangles(faces, notes), notes, _unit(comments), labels)
 
 
-def _header(path: Path, content: bytes) -> tuple[str, list[_Element], memoryview]:
+def _unit(comments: list[str]) -> str | None:
+    """The unit that a comment says, as rangecheck writes it."""
+    said = {words[1] for line in comments if len(words := line.split()) == 2 and words[0] == "unit"}
+    return said.pop() if len(said) == 1 and said <= set(MM_PER_UNIT) else None
+
+
+def _labels(comments: list[str], of_vertex: dict[str, Any], of_face: dict[str, Any]) -> Labels | None:
+    """Part and origin of each face, where the comments say them as rangecheck writes them and the values agree with the comments."""
+    legend = "origin " + " ".join(f"{i} {name}" for i, name in enumerate(ORIGIN_NAMES))
+    if legend not in comments or not {"part", "origin"} <= of_face.keys():
+        return None
+    try:
+        parts = [line.split(maxsplit=2) for line in comments if line.startswith("part ")]
+        names = tuple(str(json.loads(name)) for _, number, name in sorted(parts, key=lambda words: int(words[1])))
+    except ValueError:
+        return None
+    part, origin = np.asarray(of_face["part"]), np.asarray(of_face["origin"])
+    if len(part) and not (part.min() >= 0 and part.max() < len(names) and origin.min() >= 0 and origin.max() < len(ORIGIN_NAMES)):
+        return None
+    error = of_vertex.get("error_mm")
+    return Labels(part.astype(np.int32), names, origin.astype(np.uint8), None if error is None else np.asarray(error, np.float64))
+
+
+def _header(path: Path, content: bytes) -> tuple[str, list[_Element], memoryview, list[str]]:
     if content[:3] != b"ply":
         raise InputError(path, "does not begin with 'ply'; it is no PLY file")
     end = content.find(b"end_header", 0, 1 << 20)
@@ -87,10 +135,12 @@ def _header(path: Path, content: bytes) -> tuple[str, list[_Element], memoryview
     stop = content.find(b"\n", end)
     body = memoryview(content)[stop + 1 :] if stop >= 0 else memoryview(b"")
     form, elements = "", []
+    comments: list[str] = []
     try:
         for line in content[:end].decode("latin-1").splitlines()[1:]:
             words = line.split()
             if not words or words[0] in ("comment", "obj_info"):
+                comments.append(line.strip()[len("comment ") :])
                 continue
             if words[0] == "format":
                 form = words[1]
@@ -114,7 +164,7 @@ def _header(path: Path, content: bytes) -> tuple[str, list[_Element], memoryview
             raise InputError(
                 path, f"its header gives {e.name} {e.count} elements of {len(names)} different properties; export it again"
             )
-    return form, elements, body
+    return form, elements, body, comments
 
 
 def _triangles(faces: _Polygons, notes: list[str]) -> IntArray:
