@@ -57,7 +57,7 @@ def check_mesh_file(
         if judges is not None:
             answers = judges.answers()
     if answers:
-        found += disagreements(read.surface, answers, mm_per(read.unit), severities)
+        found += disagreements(read.surface, answers, mm_per(read.unit), severities, judged.findings)
         facts["opinions"] = [a.to_dict() for a in answers]
         if facts["closed"] and answers[-1].closed is False:
             found.append(engine_refuses(answers[-1].facts["status"], severities))

@@ -55,7 +55,11 @@ def meshlab_says(source: Path, ask: str) -> dict[str, Any]:
     if ask == "intersections":
         meshes.compute_selection_by_self_intersections_per_face()
         facts["self_intersecting_faces"] = int(meshes.current_mesh().selected_face_number())
-    return {"closed": facts["boundary_edges"] == 0 and facts["non_two_manifold_edges"] == 0, "facts": facts}
+        named = np.flatnonzero(meshes.current_mesh().face_selection_array()).tolist()
+    else:
+        named = []
+    closed = facts["boundary_edges"] == 0 and facts["non_two_manifold_edges"] == 0
+    return {"closed": closed, "facts": facts, "crossing": named, "faces": int(meshes.current_mesh().face_number())}
 
 
 def manifold_says(source: Path, ask: str) -> dict[str, Any]:

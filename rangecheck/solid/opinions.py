@@ -2,7 +2,8 @@
 
 Rules: rangecheck welds corners whose float32 bits are equal. trimesh merges vertices equal to 8 decimals of the file's unit, drops
 faces that closes, and calls a mesh watertight when each edge has two faces, whichever way they run. MeshLab merges equal vertices.
-manifold3d takes the welded mesh and asks for two opposite half-edges everywhere. Each is asked in a process of its own (judges.py), two
+manifold3d takes the welded mesh and asks for two opposite half-edges everywhere. Of faces that cross, MeshLab's test also selects such as
+touch without a common corner; rangecheck tells them apart by signs that are exact (surface/intersections.py). Each is asked in a process of its own (judges.py), two
 at a time, while the caller goes on. Files are read by trimesh's and MeshLab's own readers, but for binary STL: its records of three
 float32 corners leave nothing to interpret, so these are handed over with equal corners welded, as both programs would weld them.
 """
@@ -14,7 +15,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -35,16 +36,21 @@ TRIMESH_DECIMALS = 8
 TIMEOUT_S = 120
 #: programs that think at the same time, beside the caller
 TOGETHER = 2
+_NONE = np.empty(0, np.int64)
 
 
 @dataclass(frozen=True)
 class Opinion:
-    """What one program says: whether the mesh is closed (None where it gave no answer), what it counted, and its error if any."""
+    """What one program says: whether the mesh is closed (None where it gave no answer), what it counted, and its error if any.
+
+    crossing  (k,) the faces that it says run through others, where it was asked; `faces` is how many it numbers them among."""
 
     program: str
     closed: bool | None
     facts: Mapping[str, Any] = field(default_factory=dict)
     error: str | None = None
+    crossing: tuple[int, ...] = field(default=(), repr=False)
+    faces: int = 0
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready."""
@@ -127,16 +133,29 @@ def answer(program: str, process: subprocess.Popen[str]) -> Opinion:
         last = errors.strip().splitlines()[-1:] or [f"ended with status {process.returncode}"]
         return Opinion(program, None, error=last[0][:200])
     said = json.loads(out.strip().splitlines()[-1])
-    return Opinion(program, said.get("closed"), said.get("facts", {}), said.get("error"))
+    return Opinion(
+        program,
+        said.get("closed"),
+        said.get("facts", {}),
+        said.get("error"),
+        tuple(said.get("crossing", ())),
+        said.get("faces", 0),
+    )
 
 
 def disagreements(
-    surface: Surface, opinions: list[Opinion], unit_mm: float, severities: Mapping[str, str] | None = None
+    surface: Surface,
+    opinions: list[Opinion],
+    unit_mm: float,
+    severities: Mapping[str, str] | None = None,
+    judged: Sequence[Finding] = (),
 ) -> list[Finding]:
-    """One finding per program that judges closedness otherwise than rangecheck, with the cause as far as it can be proved."""
+    """One finding per program that judges closedness, or which faces cross, otherwise than rangecheck, with the cause as far as it can be
+    proved. `judged` are rangecheck's findings about the same surface."""
     ours = opinions[0].closed
     found = []
     for other in opinions[1:]:
+        found += _about_crossings(surface, other, judged, severities)
         if other.closed is None or other.closed == ours:
             continue
         cause = _cause(surface, other, unit_mm)
@@ -146,6 +165,37 @@ def disagreements(
             finding("opinions-differ", 1, message, surface.vertices[edges].mean(axis=1), None, severities, program=other.program)
         )
     return found
+
+
+def _about_crossings(
+    surface: Surface, other: Opinion, judged: Sequence[Finding], severities: Mapping[str, str] | None
+) -> list[Finding]:
+    """A finding where the other's faces that cross are not ours, with what ours say of those it names."""
+    if "self_intersecting_faces" not in other.facts:
+        return []
+    mine = {f.code: f.faces for f in judged if f.code in ("self-intersections", "overlapping-faces", "touching-faces")}
+    cross = np.union1d(mine.get("self-intersections", _NONE), mine.get("overlapping-faces", _NONE))
+    count = int(other.facts["self_intersecting_faces"])
+    theirs = np.array(other.crossing, np.int64)
+    comparable = other.faces == len(surface.faces)
+    if np.array_equal(theirs, cross) if comparable else count == len(cross):
+        return []
+    message = f"{other.program} says {count} faces run through others, rangecheck {len(cross)}"
+    touching = mine.get("touching-faces", _NONE)
+    places = None
+    if comparable:
+        more, less = np.setdiff1d(theirs, cross), np.setdiff1d(cross, theirs)
+        only = int(np.isin(more, touching).sum())
+        if only:
+            message += f": {only} of those it names touch others in a point or along a line and go through none, by exact signs"
+        if len(more) - only:
+            message += f"; {len(more) - only} of those it names meet none by exact signs"
+        if len(less):
+            message += f"; it does not name {len(less)} that cross or overlap by exact signs"
+        places = surface.triangles[np.concatenate([more, less])].mean(axis=1)
+    else:
+        message += f": it reads {other.faces} faces where there are {len(surface.faces)}"
+    return [finding("opinions-differ", 1, message, places, None, severities, program=other.program)]
 
 
 def _cause(surface: Surface, other: Opinion, unit_mm: float) -> str:
