@@ -293,9 +293,10 @@ def _hollows(surface: Surface, up: FloatArray, facts: dict[str, Any], severities
     found = []
     cups = [p for p in held if not p.closed]
     closed = _cavities(surface)
-    facts |= {"held_mm3": sum(p.volume_mm3 for p in cups), "trapped_mm3": sum(v for v, _ in closed)}
+    trapped = sum(v for v, _ in closed)
+    facts |= {"held_mm3": sum(p.volume_mm3 for p in cups), "trapped_mm3": trapped}
     if closed:
-        message = f"{len(closed)} closed cavities hold {sum(v for v, _ in closed):.1f} mm3 for ever"
+        message = f"{len(closed)} closed cavities hold {trapped:.1f} mm3 for ever"
         found.append(finding("trapped-volume", len(closed), message, np.array([p for _, p in closed]), None, severities))
     if cups:
         message = f"{len(cups)} hollows hold {sum(p.volume_mm3 for p in cups):.1f} mm3 when set down like this, the largest {cups[0].volume_mm3:.1f} mm3"
@@ -314,9 +315,19 @@ def _hollows(surface: Surface, up: FloatArray, facts: dict[str, Any], severities
 
 
 def _cavities(surface: Surface) -> list[tuple[float, FloatArray]]:
-    """Volume and lowest corner of each closed cavity: the shells that face inwards."""
-    from rangecheck.solid.containment import shell_volumes_mm3
+    """Volume and middle of each closed cavity: the shells that face inwards, without the bodies that lie in them."""
+    from rangecheck.solid.containment import shell_depths, shell_volumes_mm3, winding_numbers
 
     count, shell = topo.shells(surface)
     volumes = shell_volumes_mm3(surface, count, shell)
-    return [(-float(volumes[i]), surface.triangles[shell == i].reshape(-1, 3).mean(axis=0)) for i in np.flatnonzero(volumes < 0)]
+    depth = shell_depths(surface, count, shell) if (volumes < 0).any() else np.zeros(count, np.int64)
+    bodies = [i for i in np.flatnonzero(volumes > 0) if depth[i] > 0]
+    found = []
+    for i in np.flatnonzero(volumes < 0):
+        cavity = surface.with_faces(shell == i)
+        inside = [j for j in bodies if depth[j] == depth[i] + 1]
+        places = surface.triangles[[int(np.argmax(shell == j)) for j in inside], 0] if inside else np.empty((0, 3))
+        held = np.abs(winding_numbers(cavity, places)) > 0.5
+        room = -float(volumes[i]) - sum(float(volumes[j]) for j, here in zip(inside, held) if here)
+        found.append((room, cavity.triangles.reshape(-1, 3).mean(axis=0)))
+    return found
