@@ -24,7 +24,7 @@ CELLS_ACROSS = 160
 
 @dataclass(frozen=True)
 class Pocket:
-    """A hollow that keeps liquid: its volume, its lowest cell's middle, its depth, and whether no way leads out of it at all."""
+    """A hollow that keeps liquid: its volume, the middle of that of its lowest cells which is farthest from its walls, its depth, and whether no way leads out of it at all."""
 
     volume_mm3: float
     lowest_mm: FloatArray = field(repr=False)
@@ -53,8 +53,11 @@ def pockets(
     for number, where in enumerate(ndimage.find_objects(label), 1):
         if sizes[number] < least:
             continue
-        inner = np.argwhere(label[where] == number) + [s.start for s in where]
-        lowest = inner[np.argmin(inner[:, 2])]
+        mine = label[where] == number
+        inner = np.argwhere(mine) + [s.start for s in where]
+        # the middle of the floor: a drain there leaves the walls around the hollow whole
+        floor = ndimage.distance_transform_edt(np.pad(mine[:, :, 0], 1))[1:-1, 1:-1]
+        lowest = np.array([*np.unravel_index(np.argmax(floor), floor.shape), 0]) + [s.start for s in where]
         depth = float(np.ptp(inner[:, 2]) + 1) * step
         closed = bool(outside[tuple(lowest)] != open_air)
         found.append(Pocket(float(sizes[number]) * step**3, cells.places_mm(lowest[None])[0], depth, closed))

@@ -1,6 +1,6 @@
 """A solid made hollow, with drains, and the proof that it drains.
 
-The cavity is the surface at wall depth inside; where the part is thinner than two walls it stays full. Each pocket of the cavity that
+The cavity is the surface at wall depth inside, ridges and all; where the part is thinner than two walls it stays full. Each pocket of the cavity that
 keeps resin when the part stands along `up` gets a drain from its lowest place straight down through the wall, until nothing is kept;
 what is drilled out is returned as plugs, smaller by a clearance. The wall is measured afterwards, not assumed.
 """
@@ -15,12 +15,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rangecheck.arrays import BoolArray, FloatArray
+from rangecheck.arrays import FloatArray
 from rangecheck.errors import SettingError, SurfaceError
 from rangecheck.modeler.engine import manifold3d_module
 from rangecheck.solid.drainage import Pocket, pockets
 from rangecheck.solid.engine import from_engine, simplified, to_engine
 from rangecheck.solid.offset import inner_offset
+from rangecheck.solid.ridges import with_ridges
+from rangecheck.solid.room import proved_without_room
 from rangecheck.solid.slices import frame_of
 from rangecheck.solid.solid import Solid
 from rangecheck.solid.thickness import Samples, sample_surface
@@ -30,16 +32,16 @@ from rangecheck.surface.distance import SurfaceDistance
 from rangecheck.surface.surface import INVENTED, Surface
 
 SIDES = 48
-#: grid of the cavity's surface, in walls: ridges of the cavity are cut off within a cell, which makes the wall thicker there
-STEP = 0.3
+#: grid of the cavity's surface, in walls
+STEP = 0.15
+#: shares of the wall's tolerance by which the cavity may lose faces, and by which its vertices may move so that no faces cross
+FEWER, LOOSER = 1 / 16, 1 / 2
 #: how far a plug stays clear of its drain, all round
 CLEARANCE_MM = 0.1
 #: drilling stops after this many drains; so many places without room for a cavity are listed
 MOST_DRAINS, MOST_PLACES = 12, 24
-#: steps up the slope of depth in search of room for a cavity
-CLIMBS = 6
 #: of the outside, from which the wall is measured
-MOST_SAMPLES = 200_000
+MOST_SAMPLES = 40_000
 
 
 @dataclass(frozen=True)
@@ -48,8 +50,9 @@ class Wall:
     hollow by offset define it; measured from both.
 
     least_mm, median_mm, largest_mm, share_within  from the cavity to the outside, by the cavity's area; within `tolerance_mm` of `asked_mm`
-    outer_within  from the outside to the cavity: share within the tolerance of the area that leaves room for a cavity
-    full_share    share of the outside's area that leaves none: no place at least a wall deep lies within a wall and the tolerance of it
+    outer_within  from the outside to the cavity: share within the tolerance of the area that may have such a wall
+    full_share    share of the outside's area that is proved not to: no cavity that keeps the wall everywhere comes within a wall and the
+                  tolerance of it, because no place at least a wall deep does (room.py)
     full          places (x, y, z) of that area, and their distance from the cavity: edges, ears, noses; the farthest first, a few walls apart
     """
 
@@ -98,7 +101,7 @@ class Hollow:
         lines = [
             f"wall asked {w.asked_mm:g} mm; measured from the cavity {w.least_mm:.3f} to {w.largest_mm:.3f} mm, median {w.median_mm:.3f}, "
             f"within {w.tolerance_mm:g} mm over {w.share_within:.2%} of its area; from outside over {w.outer_within:.2%} of what leaves room for "
-            f"it; {w.full_share:.1%} is too sharp or too thin for a cavity and stays thicker",
+            f"it; {w.full_share:.1%} is proved too sharp or too thin for a cavity and stays thicker",
         ]
         if w.full:
             listed = ", ".join(f"({x:.1f}, {y:.1f}, {z:.1f}) {d:.1f} mm" for x, y, z, d in w.full[:6])
@@ -153,14 +156,15 @@ def hollow(
     if not (wall_mm > 0 and drain_mm >= 0):
         raise SettingError(f"wall_mm is {wall_mm} and drain_mm {drain_mm}; lengths are needed", key="wall_mm")
     outside, notes = (solid.surface, solid.notes) if isinstance(solid, Solid) else (solid, ())
-    inner = inner_offset(outside, wall_mm, step_mm or STEP * wall_mm)
+    step = step_mm or STEP * wall_mm
+    inner = inner_offset(outside, wall_mm, step)
     inner = _without_specks(inner, (drain_mm or wall_mm) ** 3) if inner is not None else None
     if inner is None:
         raise SurfaceError(
             f"nothing lies {wall_mm:g} mm deep in the part, so a wall of {wall_mm:g} mm leaves no cavity; ask for a thinner wall",
             wall_mm=wall_mm,
         )
-    inner = _fewer_faces(inner, tolerance_mm / 5)
+    inner = _fewer_faces(with_ridges(inner, SurfaceDistance(outside), wall_mm, step), tolerance_mm)
     outer, outer_name = to_engine(outside)
     cavity, cavity_name = to_engine(inner)
     sources = [(outer_name, outside), (cavity_name, inner)]
@@ -193,9 +197,10 @@ def hollow(
 
 
 def _fewer_faces(inner: Surface, tolerance_mm: float) -> Surface:
-    """The grid's many faces say no more than a few: collapsed within the tolerance, and no farther than they stay out of each other's way."""
-    for share in (1.0, 0.25):
-        loose = untangle(simplified(inner, share * tolerance_mm), max_move_mm=tolerance_mm)
+    """The grid's many faces say no more than a few: collapsed within a share of the tolerance, and no farther than they stay out of each
+    other's way."""
+    for share in (FEWER, FEWER / 4):
+        loose = untangle(simplified(inner, share * tolerance_mm), max_move_mm=LOOSER * tolerance_mm)
         if not loose.after:
             return loose.surface
     return inner
@@ -216,52 +221,28 @@ def _without_specks(inner: Surface, least_mm3: float) -> Surface | None:
 def measured_wall(outer: Surface, inner: Surface, asked_mm: float, tolerance_mm: float) -> Wall:
     """The wall between an outer surface and a cavity, over the area of both."""
     samples = sample_surface(inner, max(asked_mm, inner.extent_mm / 200))
-    distance, _ = SurfaceDistance(outer).distance_mm(samples.places_mm)
+    solid = SurfaceDistance(outer)
+    distance, _ = solid.distance_mm(samples.places_mm)
     order = np.argsort(distance, kind="stable")
     cumulated = np.cumsum(samples.area_mm2[order])
     median = float(distance[order][np.searchsorted(cumulated, cumulated[-1] / 2)])
     within = float(samples.area_mm2[np.abs(distance - asked_mm) <= tolerance_mm].sum() / cumulated[-1])
     outside = _evenly(sample_surface(outer, asked_mm / 4), MOST_SAMPLES)
     far, _ = SurfaceDistance(inner).distance_mm(outside.places_mm)
-    room = _leaves_room(outer, outside, asked_mm, tolerance_mm)
-    thick = (far > asked_mm + tolerance_mm) & ~room
+    limited = far > asked_mm + tolerance_mm
+    limited[limited] = proved_without_room(solid, outside.places_mm[limited], asked_mm, asked_mm + tolerance_mm)
     full: list[tuple[float, float, float, float]] = []
-    waiting = np.flatnonzero(thick)[np.argsort(-far[thick], kind="stable")]
+    waiting = np.flatnonzero(limited)[np.argsort(-far[limited], kind="stable")]
     while len(waiting) and len(full) < MOST_PLACES:
         x, y, z = (float(v) for v in outside.places_mm[waiting[0]])
         full.append((x, y, z, float(far[waiting[0]])))
         apart = np.linalg.norm(outside.places_mm[waiting] - outside.places_mm[waiting[0]], axis=1)
         waiting = waiting[apart > 8 * asked_mm]
-    # what is as far as was asked had room, whatever the search for room says
     good = np.abs(far - asked_mm) <= tolerance_mm
-    roomy = float(outside.area_mm2[room | good].sum())
+    roomy = float(outside.area_mm2[~limited].sum())
     share = float(outside.area_mm2[good].sum()) / roomy if roomy else 0.0
     none = 1.0 - roomy / float(outside.area_mm2.sum())
     return Wall(asked_mm, float(distance.min()), median, float(distance.max()), tolerance_mm, within, share, none, tuple(full))
-
-
-def _leaves_room(outer: Surface, samples: Samples, asked_mm: float, tolerance_mm: float) -> BoolArray:
-    """(n,) whether some place at least `asked_mm` deep lies within `asked_mm` and the tolerance of each sample: looked for straight below it,
-    then up the slope of depth from there."""
-    depth = SurfaceDistance(outer)
-    place = samples.places_mm - asked_mm * np.nan_to_num(outer.face_normals)[samples.face]
-    found = np.zeros(len(place), bool)
-    waiting = np.arange(len(place))
-    for _ in range(CLIMBS):
-        nearest = depth.nearest(place[waiting])
-        deep, _ = depth.signed_distance_mm(place[waiting])
-        lacks = asked_mm + deep
-        within = np.linalg.norm(place[waiting] - samples.places_mm[waiting], axis=1) <= asked_mm + tolerance_mm
-        # the depth that a place lacks is less than a hundredth of the tolerance: rounding of the climb, not of the shape
-        found[waiting[(lacks <= 0.01 * tolerance_mm) & within]] = True
-        on = (deep < 0) & (lacks > 0.01 * tolerance_mm) & within
-        away = place[waiting[on]] - nearest.place_mm[on]
-        length = np.linalg.norm(away, axis=1, keepdims=True)
-        place[waiting[on]] += lacks[on, None] * away / np.maximum(length, 1e-300)
-        waiting = waiting[on]
-        if not len(waiting):
-            break
-    return found
 
 
 def _evenly(samples: Samples, most: int) -> Samples:
