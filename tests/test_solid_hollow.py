@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from test_check_printing import turned
 from test_solid_repair import ball
 from test_topology import torus
 from test_topology_distance import cube
@@ -125,6 +126,19 @@ def test_a_sharp_edge_is_thin_only_as_an_edge_and_a_blade_is_thin_all_over():
     assert wall_thickness_mm(blade, samples).min() < 0.01
     thick = wall_thickness_mm(blade, samples, edge_mm=0.5)
     assert 0.04 < thick.min() < 0.06 and (thick < 0.5).mean() > 0.3
+
+
+def test_the_tip_of_a_spike_is_no_wall_though_its_sides_share_no_corner():
+    # a cone of 12 facets, 0.4 mm thin near its tip, whose sides are cut into rings, and a plate on a stalk that is as thin all over
+    spike = turned([(0, 0), (5, 0), *((0.2 * r, 20 - r) for r in (0.8, 0.6, 0.4, 0.2)), (0, 20)], 12)
+    samples = sample_surface(spike, 0.05)
+    assert wall_thickness_mm(spike, samples).min() < 0.1
+    assert wall_thickness_mm(spike, samples, edge_mm=0.5).min() > 0.15
+    plate = turned([(0, 0), (5, 0), (5, 0.1), (0, 0.1)], 48)
+    samples = sample_surface(plate, 0.2)
+    thin = wall_thickness_mm(plate, samples, edge_mm=0.5) < 0.11
+    # all but a rim of half a millimetre
+    assert samples.area_mm2[thin].sum() == pytest.approx(2 * np.pi * 4.5**2, rel=0.02)
 
 
 def test_two_chambers_get_two_drains():

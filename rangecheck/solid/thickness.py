@@ -1,8 +1,9 @@
 """How thick the walls are: from samples of the surface straight inwards to the other side; and gaps straight outwards.
 
 A ray that leaves at a slant measures more than the wall, so only opposite faces count: where the far side is turned by less than
-`FACING` from the ray, there is no wall but a wedge, and the sample has no thickness. Every sharp edge is as thin as one likes at the edge
-itself: of two faces that share a corner, what lies nearer to it than `edge_mm` is an edge and not a wall.
+`FACING` from the ray, there is no wall but a wedge, and the sample has no thickness. Every sharp edge, and the tip of every spike, is as thin
+as one likes at the edge itself: where the other side is come to from a place over edges that all lie nearer to it than `edge_mm`, that is an
+edge and not a wall.
 """
 
 from __future__ import annotations
@@ -11,14 +12,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rangecheck.arrays import BoolArray, FloatArray, IntArray
-from rangecheck.kernels import in_chunks
+from rangecheck.arrays import FloatArray, IntArray
+from rangecheck.kernels import in_chunks, kernel
 from rangecheck.raycast import EmbreeCaster
+from rangecheck.surface.edges import edge_table
 from rangecheck.surface.surface import Surface
 
 #: least cosine between the ray and the far side's normal for the two sides to make a wall (60 degrees)
 FACING = 0.5
 _CHUNK = 1 << 14
+#: faces around a place that are looked at for an edge
+MOST_FACES = 1024
 
 
 class Samples(NamedTuple):
@@ -52,7 +56,7 @@ def _middles_of_subdivision(n: int) -> FloatArray:
 
 def wall_thickness_mm(surface: Surface, samples: Samples, *, edge_mm: float = 0.0) -> FloatArray:
     """(n,) distance straight inwards from each sample to the opposite side; inf where there is none that faces it, or only a side that
-    meets the sample's own face in an edge or a corner nearer than `edge_mm`."""
+    is come to from the sample's own face over edges nearer than `edge_mm`."""
     return _reach(surface, samples, -1.0, edge_mm)
 
 
@@ -66,6 +70,12 @@ def _reach(surface: Surface, samples: Samples, way: float, edge_mm: float = 0.0)
         return np.empty(0)
     caster = EmbreeCaster(surface.vertices, surface.faces)
     normals = np.nan_to_num(surface.face_normals)
+    table = edge_table(surface)
+    longest = (
+        np.linalg.norm(surface.triangles - np.roll(surface.triangles, 1, axis=1), axis=2).max(axis=1)
+        if edge_mm > 0
+        else np.empty(0)
+    )
 
     def cast(first: int, last: int) -> FloatArray:
         n = normals[samples.face[first:last]]
@@ -74,24 +84,57 @@ def _reach(surface: Surface, samples: Samples, way: float, edge_mm: float = 0.0)
         far = normals[np.maximum(hits.face, 0)]
         # inwards the ray leaves through the far side, outwards it enters it: in both cases the two normals are opposite
         facing = np.einsum("ij,ij->i", n, far) <= -FACING
+        facing &= hits.face >= 0
         if edge_mm > 0:
-            facing &= ~_at_common_edge(surface, samples.places_mm[first:last], samples.face[first:last], hits.face, edge_mm)
-        return np.where((hits.face >= 0) & facing, hits.distance_mm + caster.skin_mm, np.inf)
+            # a far place is no farther beyond such an edge than the far face is long
+            asked = np.flatnonzero(facing & (hits.distance_mm < edge_mm + longest[np.maximum(hits.face, 0)]))
+            facing[asked] &= ~round_the_edge(
+                samples.places_mm[first:last][asked], samples.face[first:last][asked], hits.face[asked], surface.vertices, surface.faces,
+                table.edge_of_half, table.start, table.halves, edge_mm,
+            )  # fmt: skip
+        return np.where(facing, hits.distance_mm + caster.skin_mm, np.inf)
 
     return np.concatenate(in_chunks(cast, len(samples.face), _CHUNK))
 
 
-def _at_common_edge(surface: Surface, places_mm: FloatArray, face: IntArray, other: IntArray, edge_mm: float) -> BoolArray:
-    """(n,) whether a place on `face` lies nearer than `edge_mm` to the corner or edge that face and `other` (-1: none) share."""
-    own, far = surface.faces[face], surface.faces[np.maximum(other, 0)]
-    shared = (own[:, :, None] == far[:, None, :]).any(axis=2) & (other >= 0)[:, None]
-    corners = surface.vertices[own]
-    away = np.where(shared, np.linalg.norm(corners - places_mm[:, None], axis=2), np.inf).min(axis=1)
-    for i in range(3):
-        j = (i + 1) % 3
-        along = corners[:, j] - corners[:, i]
-        share = np.einsum("ij,ij->i", places_mm - corners[:, i], along) / np.maximum(np.einsum("ij,ij->i", along, along), 1e-300)
-        foot = corners[:, i] + np.clip(share, 0, 1)[:, None] * along
-        beside = np.linalg.norm(places_mm - foot, axis=1)
-        away = np.where(shared[:, i] & shared[:, j], np.minimum(away, beside), away)
-    return np.asarray(away < edge_mm)
+@kernel
+def round_the_edge(places, own, far, vertices, faces, edge_of_half, start, halves, edge_mm):
+    """(n,) whether the way over the surface from each place on the face `own` to the face `far` crosses only edges nearer than `edge_mm` to the
+    place; given up, with no, after MOST_FACES faces."""
+    found = np.zeros(len(places), np.bool_)
+    seen = np.empty(MOST_FACES, np.int32)
+    for k in range(len(places)):
+        seen[0] = own[k]
+        count, at = 1, 0
+        while at < count and not found[k]:
+            f = seen[at]
+            at += 1
+            for side in range(3):
+                edge = edge_of_half[3 * f + side]
+                if (
+                    edge < 0
+                    or _off_segment2(places[k], vertices[faces[f, side]], vertices[faces[f, (side + 1) % 3]]) >= edge_mm**2
+                ):
+                    continue
+                for h in range(start[edge], start[edge + 1]):
+                    g = halves[h] // 3
+                    if g == far[k]:
+                        found[k] = True
+                    known = False
+                    for i in range(count):
+                        known = known or seen[i] == g
+                    if not known and count < MOST_FACES:
+                        seen[count] = g
+                        count += 1
+    return found
+
+
+@kernel
+def _off_segment2(p, a, b):
+    """Squared distance of p from the segment ab."""
+    along2 = (b[0] - a[0]) ** 2 + (b[1] - a[1]) ** 2 + (b[2] - a[2]) ** 2
+    t = (p[0] - a[0]) * (b[0] - a[0]) + (p[1] - a[1]) * (b[1] - a[1]) + (p[2] - a[2]) * (b[2] - a[2])
+    t = min(1.0, max(0.0, t / along2)) if along2 > 0.0 else 0.0
+    return (
+        (p[0] - a[0] - t * (b[0] - a[0])) ** 2 + (p[1] - a[1] - t * (b[1] - a[1])) ** 2 + (p[2] - a[2] - t * (b[2] - a[2])) ** 2
+    )
