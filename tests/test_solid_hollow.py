@@ -74,7 +74,7 @@ def test_the_wall_seen_from_outside_is_judged_where_the_shape_leaves_room_for_a_
     # on each side of the cube the cavity, a cube of 14 mm, is within 3.15 mm of a square of 14 mm widened by a rim
     rim = np.sqrt(3.15**2 - 3.0**2)
     room = (14**2 + 4 * 14 * rim + np.pi * rim**2) / 20**2
-    assert wall.outer_within > 0.99 and wall.full_share == pytest.approx(1 - room, abs=0.01)
+    assert wall.outer_within > 0.99 and wall.full_share == pytest.approx(1 - room, abs=0.03)
     assert wall.full[0][3] == pytest.approx(3 * np.sqrt(3), rel=0.15) and np.abs(wall.full[0][:3]).min() > 8
 
 

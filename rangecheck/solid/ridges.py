@@ -25,6 +25,8 @@ TURN_DEG = 12.0
 ROUNDS = 2
 #: edges shorter than this share of the first step, and moves longer than this many of them, are left alone
 SHORTEST, FARTHEST = 0.15, 1.5
+#: faces whose area is below about this share of their longest side's square count as turned over
+FLAT = 1e-6
 #: times that a move is halved before it is given up
 HALVINGS = 4
 #: rings of neighbours up to which vertices of faces that meet are put back
@@ -90,7 +92,8 @@ def _unfolded(before: FloatArray, wanted: FloatArray, first: int, faces: IntArra
         places = before + share[:, None] * (wanted - before)
         a, b, c = faces.T
         normal = np.cross(places[b] - places[a], places[c] - places[a])
-        folded = np.einsum("ij,ij->i", normal, way[a] + way[b] + way[c]) <= 0
+        side2 = np.max([((places[i] - places[j]) ** 2).sum(axis=1) for i, j in ((a, b), (b, c), (c, a))], axis=0)
+        folded = np.einsum("ij,ij->i", normal, way[a] + way[b] + way[c]) <= FLAT * side2
         culprits = np.unique(faces[folded])
         culprits = culprits[(culprits >= first) & (share[culprits] > 0)]
         if not len(culprits):
