@@ -151,6 +151,38 @@ def test_a_shelf_begins_in_mid_air_once(any_printer):
     assert check_printing(Solid.from_surface(CUP), any_printer, up=Z).facts["unsupported_minima"] == 0
 
 
+def test_a_pit_under_a_wall_that_hangs_over_is_no_island(any_printer):
+    # a block with a pit of four faces that leans so far that most of what is seen from its tip looks down
+    block = box(20, 20, 20)
+    rim, tip = np.array([[8, 8, 20], [12, 8, 20], [12, 12, 20], [8, 12, 20]], float), np.array([[17, 10, 12]], float)
+    corners = np.concatenate([block.vertices, rim, tip])
+    top = np.flatnonzero((block.vertices[block.faces][:, :, 2] == 20).all(axis=1))
+    ring = block.vertices[np.unique(block.faces[top])]
+    order = np.unique(block.faces[top])[np.argsort(np.arctan2(ring[:, 1] - 10, ring[:, 0] - 10))]
+    faces = [f for i, f in enumerate(block.faces.tolist()) if i not in top]
+    for k in range(4):
+        a, b, c, d = order[k], order[(k + 1) % 4], 8 + (k + 1) % 4, 8 + k
+        faces += [[a, b, c], [a, c, d], [d, c, 12]]
+    pitted = Solid.from_surface(Surface(corners, faces))
+    assert pitted.volume_mm3 == pytest.approx(8000 - 16 * 8 / 3)
+    assert check_printing(pitted, any_printer, up=Z).facts["unsupported_minima"] == 0
+
+
+def test_a_groove_is_no_gap_at_its_bottom_and_a_slit_is_one(any_printer):
+    def wedge(width, low):
+        import manifold3d
+
+        cut = manifold3d.Manifold.hull_points(
+            [(x, y, z) for y in (-1, 21) for x, z in ((10 - width, 21), (10 + width, 21), (10 + low, 5), (10 - low, 5))]
+        )
+        mesh = (manifold3d.Manifold.cube((20, 20, 20)) - cut).to_mesh64()
+        return Solid.from_surface(Surface(mesh.vert_properties[:, :3], mesh.tri_verts.astype(int)))
+
+    # a slit 0.04 mm wide all the way down, and a groove that is as narrow only in its last third of a millimetre
+    assert check_printing(wedge(0.02, 0.02), any_printer, up=Z).has("near-sheets")
+    assert not check_printing(wedge(1.2, 0.0), any_printer, up=Z).has("near-sheets")
+
+
 def test_sections_of_a_torus_are_annuli():
     ring = torus(600, 600)
     heights = np.array([-0.9, -0.3, 0.0, 0.5])

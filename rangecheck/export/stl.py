@@ -89,7 +89,8 @@ def _pieces(surface: Surface, ascii: bool, lowered_mm: float | None = None) -> I
         yield b"solid rangecheck mm" + how + b"\n" if how else b"solid rangecheck millimetres\n"
     else:
         # filled up with zeros, because admesh prints on from a head without one into whatever lies behind it
-        yield (_STANDING_HEADER + how if how else _HEADER).ljust(80, b"\0") + np.uint32(len(surface.faces)).astype("<u4").tobytes()
+        head = (_STANDING_HEADER + how if how else _HEADER).ljust(80, b"\0")
+        yield head + np.uint32(len(surface.faces)).astype("<u4").tobytes()
     for start in range(0, len(surface.faces), 1 << 18):
         records = _records(surface, slice(start, start + (1 << 18)))
         yield _facets(records) if ascii else records.tobytes()

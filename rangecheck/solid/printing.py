@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rangecheck.arrays import FloatArray, IntArray
+from rangecheck.arrays import BoolArray, FloatArray, IntArray
 from rangecheck.solid.drainage import pockets
 from rangecheck.solid.findings import Finding, Verdict, finding, verdict
 from rangecheck.solid.printer import Printer
@@ -194,7 +194,7 @@ def _walls(
                 least_mm=float(wall[thin].min()),
             )
         )
-    gap = gap_mm(surface, samples)
+    gap = gap_mm(surface, samples, edge_mm=printer.feature_mm)
     near = gap < printer.pixel_mm
     if near.any():
         message = (
@@ -247,6 +247,8 @@ def _begins(
     lowest, group = minima(surface, heights)
     # the material is above a minimum where the faces around it look down
     down = np.bincount(group[surface.faces].ravel(), np.repeat(surface.area_vectors @ -up, 3), minlength=len(heights))
+    alone = np.bincount(group, minlength=len(heights)) == 1
+    down = np.where(alone, _round_above(surface, local, alone), down)
     begins = lowest[(down[lowest] > 0) & (heights[lowest] > heights.min() + printer.layer_mm)]
     facts["unsupported_minima"] = len(begins)
     if not len(begins):
@@ -262,6 +264,20 @@ def _begins(
             severities,
         )
     ]
+
+
+def _round_above(surface: Surface, local: FloatArray, wanted: BoolArray) -> FloatArray:
+    """(n,) for each vertex of `wanted` without a neighbour as low, the area of the section just above it through the faces around it, as a share
+    of the height squared: positive where the material is within, negative where the air is. Walls that hang over do not mislead it."""
+    total = np.zeros(len(local))
+    for corner in range(3):
+        v, a, b = (surface.faces[:, (corner + k) % 3] for k in range(3))
+        mine = np.flatnonzero(wanted[v] & (local[a, 2] > local[v, 2]) & (local[b, 2] > local[v, 2]))
+        v, a, b = v[mine], a[mine], b[mine]
+        p = (local[a, :2] - local[v, :2]) / (local[a, 2] - local[v, 2])[:, None]
+        q = (local[b, :2] - local[v, :2]) / (local[b, 2] - local[v, 2])[:, None]
+        total += np.bincount(v, p[:, 1] * q[:, 0] - p[:, 0] * q[:, 1], minlength=len(local))
+    return total
 
 
 def _overhangs(

@@ -60,9 +60,10 @@ def wall_thickness_mm(surface: Surface, samples: Samples, *, edge_mm: float = 0.
     return _reach(surface, samples, -1.0, edge_mm)
 
 
-def gap_mm(surface: Surface, samples: Samples) -> FloatArray:
-    """(n,) distance straight outwards from each sample to another side that faces it; inf where there is none."""
-    return _reach(surface, samples, 1.0)
+def gap_mm(surface: Surface, samples: Samples, *, edge_mm: float = 0.0) -> FloatArray:
+    """(n,) distance straight outwards from each sample to another side that faces it; inf where there is none, or only the other side of
+    a groove whose bottom is nearer than `edge_mm`."""
+    return _reach(surface, samples, 1.0, edge_mm)
 
 
 def _reach(surface: Surface, samples: Samples, way: float, edge_mm: float = 0.0) -> FloatArray:
