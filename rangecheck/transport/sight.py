@@ -124,6 +124,6 @@ def remember(shadows, n, pixels, lit, dark):
     for k in range(n):
         pixel, s = pixels[shadows.pixel[k]], shadows.source[k]
         if shadows.blocked[k]:
-            dark[pixel, s] = min(dark[pixel, s] + 1, _MOST)
+            dark[pixel, s] = min(np.int64(dark[pixel, s]) + 1, _MOST)
         else:
-            lit[pixel, s] = min(lit[pixel, s] + 1, _MOST)
+            lit[pixel, s] = min(np.int64(lit[pixel, s]) + 1, _MOST)
