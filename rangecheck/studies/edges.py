@@ -101,7 +101,8 @@ def highlights_part(quick: bool) -> Part:
         ]
         said.append(
             f"steel's highlights on the {name} ({made.pieces_still} without noise): half their light is astray from "
-            f"{edge.breaks_at or math.nan:.3g} degrees of facet noise; twice as many pieces at {doubled or math.nan:.3g} degrees (step of the sweep)"
+            f"{edge.breaks_at or math.nan:.3g} degrees of facet noise; "
+            + (f"twice as many pieces at {doubled:.3g} degrees (step of the sweep)" if doubled else "never twice as many pieces")
         )
     charts: list[Chart] = [
         EdgeChart(

@@ -19,6 +19,7 @@ from rangecheck.reflectance import Material, directional_albedo, lobe_brdf, spik
 from rangecheck.reflectance.energy import lobe_albedo, visibility_of, visibility_table
 from rangecheck.reflectance.fast import FAST_ERROR, lobe_fast, lobe_table
 from rangecheck.reflectance.lobe import MASKINGS, SMITH, two_numbers
+from rangecheck.reflectance.many import fill_fast
 from rangecheck.reflectance.series import lobe_rough, lobe_series, lobe_smooth
 from rangecheck.reflectance.tables import lobe_value
 from rangecheck.study import Candidate, Edge, EdgeChart, Line, LineChart, Part, SpeedChart, find_edge, measure, study_of_parts
@@ -137,8 +138,8 @@ def _forms(points: int, evaluations: int, rounds: int) -> tuple[list[SpeedChart]
 
 
 def _whole(evaluations: int, rounds: int) -> tuple[SpeedChart, list[dict[str, Any]]]:
-    """The lobe itself from three angles, as notebooks call it, checks and cosines included; and as the tracer calls it, from cosines,
-    masked, bounded, with Fresnel's share. Errors against the series at the same angles, within e^-30 of the peak."""
+    """The lobe itself from three angles, as notebooks call it, checks and cosines included; by its kernel alone; and as the tracer calls it,
+    from cosines, masked, bounded, with Fresnel's share. Errors against the series at the same angles, within e^-30 of the peak."""
     rng = np.random.default_rng(7)
     theta_i = rng.uniform(0.0, 1.5, evaluations)
     theta_r = np.clip(theta_i + rng.normal(0.0, 0.1, evaluations), 0.0, 1.55)
@@ -152,6 +153,13 @@ def _whole(evaluations: int, rounds: int) -> tuple[SpeedChart, list[dict[str, An
             key = (f"lobe_brdf, {form}", f"σ {sigma:g} T {correlation:g}")
             errors[key] = float(np.abs(lobe_brdf(*angles, form=form, **surface)[seen] / exact[seen] - 1.0).max())
             candidates.append(Candidate(*key, partial(_called, lobe_brdf, angles, {"form": form, **surface}, key)))
+        key = ("fast kernel, from angles", f"σ {sigma:g} T {correlation:g}")
+        alone = np.empty(evaluations)
+        numbers = [np.array([value]) for value in two_numbers(sigma, correlation, GREEN_UM)]
+        given = (lobe_table(), *angles, *numbers, 0, evaluations, alone, *([np.empty(0)] * 3))
+        fill_fast(*given)
+        errors[key] = float(np.abs(alone[seen] / exact[seen] - 1.0).max())
+        candidates.append(Candidate(*key, partial(_called, fill_fast, given, {}, key)))
         key = ("tracer's lobe_value", f"σ {sigma:g} T {correlation:g}")
         material = Material("surface", K_s=1.0, sigma_um=sigma, correlation_um=correlation, wavelengths_um=(GREEN_UM,))
         cosines = [np.cos(theta_i), np.cos(theta_r)]
@@ -374,12 +382,30 @@ def _grazing_part(quick: bool) -> Part:
     grazing, rows = _grazing(24 if quick else 60)
     by_roughness, edges = _grazing_by_roughness(4 if quick else 13)
     said = [f"published model, {row['in_words']}" for row in rows]
+    for long in sorted({row["correlation_per_wavelength"] for row in edges}):
+        found = ", ".join(
+            f"{row['breaks_at_degrees']:.3g} at σ = {row['sigma_per_wavelength']:.3g} λ"
+            for row in edges
+            if row["correlation_per_wavelength"] == long
+        )
+        said.append(f"published model, T = {long:g} λ: exceeds albedo 1 from these degrees on (nan: nowhere below 89.9): {found}")
     return Part([grazing, by_roughness], said, {"grazing_edges": rows, "grazing_by_roughness": edges})
 
 
 def _changes_part(quick: bool) -> Part:
     charts, rows = _changes(30 if quick else 90)
-    return Part(charts, (), {"masking_and_bound": rows})
+    most: dict[str, tuple[float, float, str]] = {}
+    for row in rows:
+        where = (row["albedo"], row["degrees"], f"σ {row['sigma_um']:g} µm, T {row['correlation_um']:g} µm")
+        most[row["variant"]] = max(most.get(row["variant"], where), where)
+    said = [f"{variant}: albedo at most {a:.6g}, at {d:.3g} degrees, {which}" for variant, (a, d, which) in most.items()]
+    kept = next(chart for chart in charts if chart.slug == "kept")
+    said += [
+        f"{line.label}: masking and bound keep {100 * float(np.interp(60.0, line.x, line.y)):.3g} % of the published lobe at 60 degrees, "
+        f"{100 * float(np.interp(80.0, line.x, line.y)):.3g} % at 80, {100 * float(np.interp(85.0, line.x, line.y)):.3g} % at 85"
+        for line in kept.lines
+    ]
+    return Part(charts, said, {"masking_and_bound": rows})
 
 
 _PARTS = {"forms": _forms_part, "limits": _limits_part, "grazing": _grazing_part, "bound": _changes_part}
