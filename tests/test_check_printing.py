@@ -9,7 +9,7 @@ from rangecheck.errors import InputError, SettingError, SurfaceError
 from rangecheck.solid import Solid
 from rangecheck.solid.drainage import pockets
 from rangecheck.solid.printer import Printer, printer, printer_names
-from rangecheck.solid.printing import centre_of_mass, check_printing, convex_hull, smallest_footprint
+from rangecheck.solid.printing import centre_of_mass, check_printing, convex_hull, round_above, smallest_footprint
 from rangecheck.solid.slices import cells_of, section_areas_mm2
 from rangecheck.solid.thickness import gap_mm, sample_surface, wall_thickness_mm
 from rangecheck.surface import Surface
@@ -151,21 +151,16 @@ def test_a_shelf_begins_in_mid_air_once(any_printer):
     assert check_printing(Solid.from_surface(CUP), any_printer, up=Z).facts["unsupported_minima"] == 0
 
 
-def test_a_pit_under_a_wall_that_hangs_over_is_no_island(any_printer):
-    # a block with a pit of four faces that leans so far that most of what is seen from its tip looks down
-    block = box(20, 20, 20)
-    rim, tip = np.array([[8, 8, 20], [12, 8, 20], [12, 12, 20], [8, 12, 20]], float), np.array([[17, 10, 12]], float)
-    corners = np.concatenate([block.vertices, rim, tip])
-    top = np.flatnonzero((block.vertices[block.faces][:, :, 2] == 20).all(axis=1))
-    ring = block.vertices[np.unique(block.faces[top])]
-    order = np.unique(block.faces[top])[np.argsort(np.arctan2(ring[:, 1] - 10, ring[:, 0] - 10))]
-    faces = [f for i, f in enumerate(block.faces.tolist()) if i not in top]
-    for k in range(4):
-        a, b, c, d = order[k], order[(k + 1) % 4], 8 + (k + 1) % 4, 8 + k
-        faces += [[a, b, c], [a, c, d], [d, c, 12]]
-    pitted = Solid.from_surface(Surface(corners, faces))
-    assert pitted.volume_mm3 == pytest.approx(8000 - 16 * 8 / 3)
-    assert check_printing(pitted, any_printer, up=Z).facts["unsupported_minima"] == 0
+@pytest.mark.parametrize("island", [True, False])
+def test_a_tip_that_leans_far_is_told_from_a_pit_by_its_section(island):
+    # just above the tip the section is a unit square, aside of it; the faces end so unevenly that together they look the other way
+    heights = np.array([3.0, 1.0, 1.0, 3.0])
+    section = np.array([[1, -0.5], [2, -0.5], [2, 0.5], [1, 0.5]])
+    cone = np.concatenate([[[0, 0, 0]], np.column_stack([section * heights[:, None], heights])])
+    faces = np.array([[0, 1 + (k + 1) % 4, 1 + k] for k in range(4)])
+    tip = Surface(cone, faces if island else faces[:, ::-1])
+    assert round_above(tip, tip.vertices, np.arange(5) == 0)[0] == pytest.approx(1.0 if island else -1.0)
+    assert ((tip.area_vectors @ [0, 0, -1.0]).sum() > 0) != island
 
 
 def test_a_groove_is_no_gap_at_its_bottom_and_a_slit_is_one(any_printer):

@@ -248,7 +248,7 @@ def _begins(
     # the material is above a minimum where the faces around it look down
     down = np.bincount(group[surface.faces].ravel(), np.repeat(surface.area_vectors @ -up, 3), minlength=len(heights))
     alone = np.bincount(group, minlength=len(heights)) == 1
-    down = np.where(alone, _round_above(surface, local, alone), down)
+    down = np.where(alone, round_above(surface, local, alone), down)
     begins = lowest[(down[lowest] > 0) & (heights[lowest] > heights.min() + printer.layer_mm)]
     facts["unsupported_minima"] = len(begins)
     if not len(begins):
@@ -266,7 +266,7 @@ def _begins(
     ]
 
 
-def _round_above(surface: Surface, local: FloatArray, wanted: BoolArray) -> FloatArray:
+def round_above(surface: Surface, local: FloatArray, wanted: BoolArray) -> FloatArray:
     """(n,) for each vertex of `wanted` without a neighbour as low, the area of the section just above it through the faces around it, as a share
     of the height squared: positive where the material is within, negative where the air is. Walls that hang over do not mislead it."""
     total = np.zeros(len(local))
@@ -276,7 +276,7 @@ def _round_above(surface: Surface, local: FloatArray, wanted: BoolArray) -> Floa
         v, a, b = v[mine], a[mine], b[mine]
         p = (local[a, :2] - local[v, :2]) / (local[a, 2] - local[v, 2])[:, None]
         q = (local[b, :2] - local[v, :2]) / (local[b, 2] - local[v, 2])[:, None]
-        total += np.bincount(v, p[:, 1] * q[:, 0] - p[:, 0] * q[:, 1], minlength=len(local))
+        total += np.bincount(v, 0.5 * (p[:, 1] * q[:, 0] - p[:, 0] * q[:, 1]), minlength=len(local))
     return total
 
 
