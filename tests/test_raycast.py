@@ -26,13 +26,15 @@ def rays_at(vertices, n, seed, away_mm=150.0):
     return origins, directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-@pytest.fixture(params=["direct", "embreex"])
+@pytest.fixture(params=["direct", "compact", "embreex"])
 def engine(request, monkeypatch):
-    """Embree called directly and through embreex: the same answers are expected of both."""
+    """Embree called directly, with the trees of large meshes, and through embreex: the same answers are expected of all."""
     if request.param == "embreex":
         monkeypatch.setattr(direct, "load", lambda: None)
     elif direct.load() is None:
         pytest.skip("Embree's library cannot be called directly here")
+    if request.param == "compact":
+        monkeypatch.setattr(direct, "COMPACT_FROM", 1)
     return EmbreeCaster
 
 

@@ -40,6 +40,10 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
         _POINTER,
         [_POINTER, ctypes.c_int, ctypes.c_uint, ctypes.c_int, ctypes.c_size_t, ctypes.c_size_t],
     ),
+    "rtcSetSharedGeometryBuffer": (
+        None,
+        [_POINTER, ctypes.c_int, ctypes.c_uint, ctypes.c_int, _POINTER, ctypes.c_size_t, ctypes.c_size_t, ctypes.c_size_t],
+    ),
     "rtcCommitGeometry": (None, [_POINTER]),
     "rtcAttachGeometry": (ctypes.c_uint, [_POINTER, _POINTER]),
     "rtcReleaseGeometry": (None, [_POINTER]),
@@ -53,7 +57,9 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
 #: what the engine's float32 may be off by, where numbers are about 1
 _ROUNDING = 4 * float(np.finfo(np.float32).eps)
 _TRIANGLES, _INDEX_BUFFER, _VERTEX_BUFFER, _UINT3, _FLOAT3 = 0, 0, 1, 0x5003, 0x9003
-_ROBUST = 1 << 2  # watertight at shared edges
+_COMPACT, _ROBUST = 1 << 1, 1 << 2  # less memory and somewhat slower; watertight at shared edges
+#: from so many faces on a tree is compact: what decides is the mesh, not the machine, so that the same ray hits the same face everywhere
+COMPACT_FROM = 4_000_000
 #: rays of a packet, the widest first, and the property that says whether the processor has them
 _WIDTHS = {16: 34, 8: 33}
 _COHERENT = 1 << 16
@@ -140,6 +146,10 @@ def _commit(library: ctypes.CDLL, scene: int) -> None:
         _awake.append(library.rtcNewDevice(b"threads=2"))
 
 
+def _release(library: ctypes.CDLL, scene: int, faces: IntArray) -> None:
+    library.rtcReleaseScene(scene)
+
+
 class DirectScene:
     """Triangles (n, 3) float32 local, (m, 3) int32 in one Embree scene."""
 
@@ -150,17 +160,22 @@ class DirectScene:
         assert library is not None
         self._width = _width(library, device)
         self._scene = library.rtcNewScene(device)
-        library.rtcSetSceneFlags(self._scene, _ROBUST)
+        library.rtcSetSceneFlags(self._scene, _ROBUST | (_COMPACT if len(faces) >= COMPACT_FROM else 0))
         geometry = library.rtcNewGeometry(device, _TRIANGLES)
-        for kind, form, values in ((_VERTEX_BUFFER, _FLOAT3, vertices), (_INDEX_BUFFER, _UINT3, faces)):
-            content = np.ascontiguousarray(values)
-            place = library.rtcSetNewGeometryBuffer(geometry, kind, 0, form, 12, len(content))
-            ctypes.memmove(place, content.ctypes.data, content.nbytes)
+        content = np.ascontiguousarray(vertices)
+        place = library.rtcSetNewGeometryBuffer(geometry, _VERTEX_BUFFER, 0, _FLOAT3, 12, len(content))
+        if not place:
+            raise MemoryError
+        ctypes.memmove(place, content.ctypes.data, content.nbytes)
+        # indices are the larger part, and are read where they stand
+        self._faces = np.ascontiguousarray(faces)
+        library.rtcSetSharedGeometryBuffer(geometry, _INDEX_BUFFER, 0, _UINT3, self._faces.ctypes.data, 0, 12, len(self._faces))
         library.rtcCommitGeometry(geometry)
         library.rtcAttachGeometry(self._scene, geometry)
         library.rtcReleaseGeometry(geometry)
         _commit(library, self._scene)
-        weakref.finalize(self, library.rtcReleaseScene, self._scene)
+        # the scene goes before the indices that it reads
+        weakref.finalize(self, _release, library, self._scene, self._faces)
         self._address = {
             name: ctypes.cast(getattr(library, name), _POINTER).value
             for name in ("rtcIntersect1", "rtcOccluded1", f"rtcIntersect{self._width}", f"rtcOccluded{self._width}")
