@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import functools
 import json
+import re
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -182,13 +184,21 @@ def show(outcome: Outcome, as_json: bool) -> int:
     return 0 if outcome.fit else 1
 
 
+#: how each line of a log begins
+_LOGGED = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z ")
+
+
 class Log:
-    """Lines with the time (UTC), appended to a file. Raises OutputError at once when it cannot be written."""
+    """Lines with the time (UTC), appended to a file. Raises OutputError at once when it cannot be written, or holds something else than a log."""
 
     def __init__(self, path: str) -> None:
         from rangecheck.errors import OutputError
 
         try:
+            with suppress(FileNotFoundError), Path(path).open("rb") as before:
+                first = before.readline(100)
+                if first and not _LOGGED.match(first):
+                    raise OutputError(path, "is no log of rangecheck; choose another --log")
             Path(path).parent.mkdir(parents=True, exist_ok=True)
             self._file = Path(path).open("a", encoding="utf-8")  # noqa: SIM115 - closed by the reporter
         except OSError as error:

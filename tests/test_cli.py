@@ -186,3 +186,7 @@ def test_a_log_holds_what_was_done_and_how_it_ended(capsys, tmp_path):
     lines = log.read_text().splitlines()
     assert any("open-edges" in line for line in lines) and "does not exist" in lines[-1]
     assert all(re.match(r"\d{4}-\d\d-\d\dT[\d:.]+Z ", line) for line in lines)
+    letter = tmp_path / "letter.txt"
+    letter.write_text("Dear Ann,\n")
+    assert "is no log" in complaint(capsys, "explain", "open-edges", "--log", letter)
+    assert letter.read_text() == "Dear Ann,\n"

@@ -9,6 +9,7 @@ import importlib
 import json
 import os
 import resource
+import shutil
 import subprocess
 import sys
 import time
@@ -100,8 +101,8 @@ def inputs(folder: Path) -> list[str]:
     (folder / "broken.toml").write_text("seed = [")
     (folder / "empty").mkdir()
     (folder / "a.json").write_text(json.dumps({"schema": "rangecheck/scans/1"}))
-    found = [str(path) for path in folder.iterdir()]
-    return [*found, str(presets_folder() / "scenes" / "bored_block.toml"), str(folder / "missing.ply")]
+    shutil.copy(presets_folder() / "scenes" / "bored_block.toml", folder)
+    return [*map(str, folder.iterdir()), str(folder / "missing.ply")]
 
 
 def feed(folder: Path, count: int, seed: int) -> None:
