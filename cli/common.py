@@ -151,6 +151,7 @@ def common(*names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
                 from rangecheck import kernels
 
                 kernels.set_threads(threads)
+            _keep_inputs(kwargs)
             reporter = ConsoleReporter(-1 if quiet else verbose, Log(log) if log else None)
             try:
                 outcome: Outcome = function(*args, reporter=reporter, **kwargs)
@@ -172,6 +173,24 @@ def common(*names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
         return command
 
     return decorate
+
+
+#: options and arguments that name what is written, by their names in Python
+_WRITTEN = ("out", "frames_dir")
+
+
+def _keep_inputs(given: dict[str, Any]) -> None:
+    """Raises OutputError where a command would write over what it reads, --force or not."""
+    written = [Path(given[name]) for name in _WRITTEN if given.get(name)]
+    for output in filter(Path.exists, written):
+        for name, value in given.items():
+            for one in value if isinstance(value, tuple) else (value,):
+                if name not in _WRITTEN and isinstance(one, str) and one and len(one) < 4096 and "\0" not in one:
+                    with suppress(OSError):
+                        if output.samefile(one):
+                            from rangecheck.errors import OutputError
+
+                            raise OutputError(output, "is read by this command; choose another place for what it writes")
 
 
 def show(outcome: Outcome, as_json: bool) -> int:

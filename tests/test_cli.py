@@ -178,6 +178,15 @@ def test_a_command_that_passes_its_memory_ends_and_says_so(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["ball.ply"]
 
 
+@pytest.mark.parametrize("command", [["solid"], ["mesh"], ["run"], ["maps"], ["dataset", "--count", "1"]])
+def test_no_command_writes_over_what_it_reads(command, capsys, tmp_path, sample_data):
+    (tmp_path / "here").write_bytes(b"precious")
+    (tmp_path / "link").symlink_to(tmp_path / "here")
+    option = "--out" if command[0] in ("run", "maps", "dataset") else "-o"
+    assert "choose another place" in complaint(capsys, *command, tmp_path / "here", option, tmp_path / "link", "--force")
+    assert (tmp_path / "here").read_bytes() == b"precious"
+
+
 def test_a_log_holds_what_was_done_and_how_it_ended(capsys, tmp_path):
     log = tmp_path / "logs" / "a b.log"
     assert exit_status(["explain", "open-edges", "--log", str(log)]) == 0
