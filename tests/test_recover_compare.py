@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rangecheck_cli.main import exit_status
 
 from rangecheck.errors import ScanError
 from rangecheck.optics import PinholeCamera
-from rangecheck.recover.compare import compare, fit_to_scan
+from rangecheck.recover.compare import compare
 from rangecheck.recover.grid import normals_at, scan_grid
 from rangecheck.recover.lights import Light
 from rangecheck.scan import RangeScan
@@ -39,8 +40,7 @@ def ball_scan(range_noise_mm=0.02, picture_noise=0.01, paint=0.0, seed=0):
 @pytest.fixture(scope="module")
 def clean():
     scan = ball_scan()
-    fitted = fit_to_scan(scan_grid(scan), 2.5, pixels=1500)
-    return scan, fitted, compare(scan, scale_mm=2.5, fitted=fitted)
+    return scan, compare(scan, scale_mm=2.5)
 
 
 def dented(scan, row, column, depth_mm=1.0, radius_mm=10.0):
@@ -60,40 +60,69 @@ def test_normals_of_a_scanned_ball_are_those_of_the_ball():
 
 
 def test_the_lamp_of_a_scan_s_picture_is_found_on_its_own_surface(clean):
-    _, fitted, _ = clean
-    light: Light = fitted.problem.lights[0]
+    light: Light = clean[1].fitted.problem.lights[0]
     centre = np.array([0.0, 0.0, AWAY_MM])
     towards = light.centre_mm - centre
     assert np.degrees(np.arccos(towards @ LAMP / np.linalg.norm(towards))) < 3.0
 
 
 def test_nothing_is_named_where_scan_and_picture_are_of_the_same_thing(clean):
-    assert clean[2].regions == ()
-    assert clean[2].judged > 0.5
+    assert clean[1].regions == ()
+    assert clean[1].judged > 0.5
 
 
-def test_a_dent_that_the_picture_does_not_show_is_named_at_its_place(clean):
-    scan, fitted, _ = clean
-    found = compare(dented(scan, 110, 90), scale_mm=2.5, fitted=fitted)
-    assert len(found.regions) >= 1
-    assert all(np.linalg.norm(np.subtract(r.middle_mm, scan.grid_points_mm[110, 90])) < 12.0 for r in found.regions)
-    assert "shape" in {r.kind for r in found.regions}
+def test_a_dent_that_the_picture_does_not_show_is_named_at_its_place_with_its_depth(clean):
+    scan, found = clean
+    dent = compare(dented(scan, 110, 90), scale_mm=2.5, fitted=found.fitted)
+    assert len(dent.regions) >= 1
+    assert all(np.linalg.norm(np.subtract(r.middle_mm, scan.grid_points_mm[110, 90])) < 12.0 for r in dent.regions)
+    worst = dent.regions[0]
+    assert worst.kind == "shape" and dent.amount_mm[worst.cell] == pytest.approx(1.0, abs=0.35)
 
 
-def test_a_step_between_two_halves_of_a_scan_is_named_as_one_of_registration(clean):
-    scan, fitted, _ = clean
+def test_a_step_between_two_halves_of_a_scan_is_named_on_its_line(clean):
+    scan, found = clean
     ranges = scan.range_mm.copy()
     ranges[:, 120:] += 0.3
-    found = compare(replace(scan, range_mm=ranges), scale_mm=0.8, fitted=fitted)
-    worst = found.regions[0]
-    assert worst.kind == "registration"
-    assert abs(worst.middle_mm[0] - scan.grid_points_mm[100, 120, 0]) < 6.0
+    step = compare(replace(scan, range_mm=ranges), scale_mm=0.8, fitted=found.fitted)
+    assert step.regions
+    assert all(abs(scan.grid_points_mm[r.cell][0] - scan.grid_points_mm[100, 120, 0]) < 6.0 for r in step.regions)
 
 
-def test_strong_paint_that_knows_nothing_of_the_shape_raises_few_false_alarms():
+def test_a_spot_of_paint_is_no_fault_of_the_shape(clean):
+    scan, found = clean
+    points = scan.grid_points_mm
+    spot = np.where(np.linalg.norm(points - points[110, 90], axis=-1) < 6.0, 0.8, 1.0)
+    named = compare(replace(scan, brightness=(spot * scan.brightness).astype(np.float32)), scale_mm=2.5, fitted=found.fitted)
+    assert named.regions and {r.kind for r in named.regions} == {"albedo"}
+
+
+def test_on_strong_paint_nothing_is_judged_and_nothing_named():
     found = compare(ball_scan(paint=0.5), scale_mm=2.5)
-    judged = np.isfinite(found.z).sum() * found.grid.spacing_mm**2
-    assert sum(region.area_mm2 for region in found.regions) < 0.01 * judged
+    assert found.judged == 0.0 and found.regions == ()
+    # and it says what it would have seen
+    assert np.nanmedian(found.least_mm) > 1.0
+
+
+def test_check_names_the_place_in_mm_and_explains_it(tmp_path, clean, capsys):
+    import json
+
+    from rangecheck.scan.readers import write_scans
+
+    scan = clean[0]
+    for name, made in (("clean", scan), ("dented", dented(scan, 110, 90))):
+        write_scans(tmp_path / name, [replace(made, name=name, brightness=np.nan_to_num(made.brightness))], step_mm=0.01)
+        capsys.readouterr()
+        exit_status(["check", str(tmp_path / name), "--json"])
+        row = json.loads(capsys.readouterr().out)["files"][0]
+        assert row["pictures"][0]["by"] == "shading" and row["pictures"][0]["judged"] > 0.3
+        if name == "clean":
+            assert row["findings"] == []
+            continue
+        [found] = row["findings"]
+        assert found["code"] == "scan-contradicts-picture" and found["severity"] == "warning"
+        assert np.linalg.norm(np.array(found["places_mm"]) - scan.grid_points_mm[110, 90], axis=1).max() < 12.0
+    assert exit_status(["explain", "scan-contradicts-picture"]) == 0
 
 
 def test_a_scan_without_a_picture_or_without_distances_is_refused():

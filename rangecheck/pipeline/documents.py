@@ -133,8 +133,8 @@ def _consistency(speckle: Shape, outline: Shape, place: Shape) -> dict[str, Shap
 
 def _documents() -> dict[str, tuple[Any, ...]]:
     """Of each document what it is, and its forms."""
-    from rangecheck.recover.compare import Region
     from rangecheck.recover.polish import Estimate
+    from rangecheck.recover.regions import Region
     from rangecheck.solid.findings import Explanation
     from rangecheck.solid.hollow import Wall
     from rangecheck.solid.orientation import Orientation
@@ -160,7 +160,9 @@ def _documents() -> dict[str, tuple[Any, ...]]:
     )  # fmt: skip
     scans_checked = record(
         file=TEXT, kind=one_of("scans"), scans=many(ref("scan")), fit=FLAG, registration=or_null(ref("registration")), filtered=maybe(TEXTS),
-        quality=or_null(ref("quality")),
+        quality=or_null(ref("quality")), findings=many(ref("finding")),
+        pictures=many(record(name=TEXT, by=one_of("second picture", "shading", "none"), judged=NUMBER, least_mm=maybe(or_null(NUMBER)),
+                             paint=maybe(NUMBER), refused=maybe(TEXT), regions=regions)),
     )  # fmt: skip
     posed = record(picture=TEXT, world_from_camera=POSE)
     view = {"camera": ref("camera"), "world_from_camera": maybe(POSE)}
@@ -271,7 +273,7 @@ def _documents() -> dict[str, tuple[Any, ...]]:
         "explained": (
             "`fit` of a scan to its own brightness",
             record(fit=FLAG, inputs=NAMES, seconds=NUMBERS,
-                   scans=many(record(name=TEXT, judged=NUMBER, light_direction=POINT, light_distance_mm=NUMBER, material=by_name(ANYTHING),
+                   scans=many(record(name=TEXT, judged=NUMBER, paint=NUMBER, light_direction=POINT, light_distance_mm=NUMBER, material=by_name(ANYTHING),
                                      not_determined=TEXTS, regions=regions))),
         ),
         "study": (

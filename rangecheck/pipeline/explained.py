@@ -1,26 +1,131 @@
-"""A scan against its own brightness image: what `fit` does with a scan, and `check` with one that has a picture."""
+"""A scan against the pictures that belong to it: what `fit` does with a scan, and `check` with one that has a picture.
+
+A structured-light scan of two cameras is held against the second camera's picture, any other against its own brightness."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from rangecheck import rigid
 from rangecheck.arrays import FloatArray
+from rangecheck.errors import ScanError
 from rangecheck.export.pictures import write_png
 from rangecheck.optics import Sensor
 from rangecheck.pipeline.outcome import Outcome, document
-from rangecheck.pipeline.subject import hashes, read_all_scans
+from rangecheck.pipeline.subject import hashes, holds_capture, read_all_scans
 from rangecheck.progress import Reporter
-from rangecheck.recover.compare import Comparison, compare
+from rangecheck.recover.compare import JUDGED_MM, Comparison, compare
+from rangecheck.recover.regions import AGAINST_SHAPE, Region
+from rangecheck.recover.second_view import Agreement, second_view
 from rangecheck.scan import RangeScan
+from rangecheck.solid.findings import Finding, finding
 
 #: cells of the grid on which scan and picture are compared, about
 _CELLS = 400_000
 #: regions told of in lines; the document has all
 _TOLD = 12
+_CODE = "scan-contradicts-picture"
+
+
+@dataclass(frozen=True)
+class Pictured:
+    """Scans against their pictures: `facts` JSON-ready, scan by scan, `lines` for a person, `findings` with places in the world frame."""
+
+    facts: list[dict[str, Any]]
+    lines: list[str]
+    findings: list[Finding]
+
+
+def pictured(path: str | Path, scans: Sequence[Any], severities: Mapping[str, str], reporter: Reporter) -> Pictured:
+    """What the pictures say of the scans that were read from `path`; those without a picture are passed over."""
+    facts: list[dict[str, Any]] = []
+    lines: list[str] = []
+    findings: list[Finding] = []
+    for scan in scans:
+        if not isinstance(scan, RangeScan) or scan.brightness is None:
+            continue
+        try:
+            with reporter.stage(f"comparing {scan.name} with its picture"):
+                about, regions, said = _by_second_picture(path, scan) or _by_shading(scan)
+        except ScanError as refusal:
+            facts.append({"name": scan.name, "by": "none", "judged": 0.0, "regions": [], "refused": str(refusal)})
+            lines.append(f"not held against its picture: {refusal}")
+            continue
+        facts.append({"name": scan.name, **about, "regions": [vars(region) for region in regions]})
+        lines += said
+        wrong = [region for region in regions if region.kind in AGAINST_SHAPE]
+        if wrong:
+            places = rigid.move_points(scan.world_from_scan, np.array([region.middle_mm for region in wrong]))
+            kinds = " and ".join(f"{sum(r.kind == kind for r in wrong)} of {kind}" for kind in AGAINST_SHAPE)
+            message = f"{scan.name}: at {len(wrong)} places its shape is not what its picture shows ({kinds})"
+            findings.append(
+                finding(_CODE, len(wrong), message, places, None, severities, kinds=[region.kind for region in wrong])
+            )
+            lines.append(f"{findings[-1].severity}: {message}; rangecheck explain {_CODE}")
+    return Pictured(facts, lines, findings)
+
+
+def _by_second_picture(path: str | Path, scan: RangeScan) -> tuple[dict[str, Any], tuple[Region, ...], list[str]] | None:
+    """By the right camera's picture of a folder of structured light; None where there is none."""
+    if not holds_capture(Path(path)):
+        return None
+    from rangecheck.scan.decode import read_capture
+
+    capture = read_capture(path)
+    if capture.right is None or capture.right_view is None:
+        return None
+    sensor = Sensor(bits=0, response="srgb")
+    assert scan.brightness is not None
+    linear = replace(scan, brightness=sensor.linearise(scan.brightness).astype(np.float32))
+    right = sensor.linearise(capture.right.white / capture.right.full_scale)
+    found: Agreement = second_view(linear, right, capture.right_view, step=_step(scan))
+    said = [
+        f"{scan.name}: {found.judged:.0%} of it held against the second camera's picture, where steps of {found.level_mm:.2f} mm are named; elsewhere the "
+        "two pictures have too little in common",
+        *_places(found.regions),
+    ]
+    return {"by": "second picture", "judged": found.judged, "least_mm": found.level_mm}, found.regions, said
+
+
+def _by_shading(scan: RangeScan) -> tuple[dict[str, Any], tuple[Region, ...], list[str]]:
+    found = compared(scan, "linear")
+    known = found.least_mm[np.isfinite(found.least_mm)]
+    about = {
+        "by": "shading",
+        "judged": found.judged,
+        "least_mm": float(np.median(known)) if known.size else None,
+        "paint": found.paint,
+    }
+    return about, found.regions, [_judged_line(scan.name, found), *_places(found.regions)]
+
+
+def _judged_line(name: str, found: Comparison) -> str:
+    known = found.least_mm[np.isfinite(found.least_mm)]
+    least = f"dents of {np.median(known):.2f} mm (median) would be named" if known.size else "nothing of it is lit well enough"
+    if found.judged == 0.0:
+        return (
+            f"{name}: its brightness differs by {found.paint:.1%} from the scan's shading in structures of a dent's size (paint, or noise of the ranges), so "
+            f"that only {least}: its shape cannot be judged to {JUDGED_MM:g} mm by it"
+        )
+    return f"{name}: {found.judged:.0%} of it judged by its brightness to {JUDGED_MM:g} mm; {least}; elsewhere paint, shadow or grazing light hide the shape"
+
+
+def _places(regions: Sequence[Region]) -> list[str]:
+    lines = []
+    for region in regions[:_TOLD]:
+        x, y, z = region.middle_mm
+        lines.append(
+            f"  {region.kind} at {x:.1f}, {y:.1f}, {z:.1f} mm: {region.area_mm2:.0f} mm2, {region.length_mm:.0f} x {region.width_mm:.0f} mm, "
+            f"z {region.z:.1f}"
+        )
+    if len(regions) > _TOLD:
+        lines.append(f"  and {len(regions) - _TOLD} more")
+    return lines
 
 
 def fit_scan(
@@ -29,6 +134,7 @@ def fit_scan(
     """Material and lamp of a scan's brightness image on the scan's own surface, and where the scan does not explain it."""
     scans = read_all_scans([path], unit, reporter)
     results, lines = [], []
+    fit = True
     for scan in scans:
         if not isinstance(scan, RangeScan):
             continue
@@ -36,12 +142,18 @@ def fit_scan(
             found = compared(scan, response, scale_mm)
         results.append({"name": scan.name} | facts(found))
         lines += told(scan.name, found)
+        fit &= not any(region.kind in AGAINST_SHAPE for region in found.regions)
         if out is not None:
             name = Path(out) if len(scans) == 1 else Path(out).with_name(f"{Path(out).stem}-{scan.name}{Path(out).suffix}")
             write_png(name, residual_picture(found), force=force)
-            lines.append(f"{name}: dark where the scan's shading is not in the picture, bright where the picture has more of it")
-    fit = not any(result["regions"] for result in results)
+            lines.append(
+                f"{name}: dark where the picture shows less range than the scan, bright where more, blue where it was not compared"
+            )
     return Outcome(document("explained", fit=fit, scans=results, inputs=hashes([path]), seconds=reporter.seconds), lines, fit)
+
+
+def _step(scan: RangeScan) -> int:
+    return max(1, round(float(np.sqrt(scan.range_mm.size / _CELLS))))
 
 
 def compared(scan: RangeScan, response: str, scale_mm: float | None = None) -> Comparison:
@@ -49,8 +161,7 @@ def compared(scan: RangeScan, response: str, scale_mm: float | None = None) -> C
     if scan.brightness is not None and response != "linear":
         linear = Sensor(bits=0, response=response).linearise(scan.brightness)
         scan = replace(scan, brightness=linear.astype(np.float32))
-    step = max(1, round(float(np.sqrt(scan.range_mm.size / _CELLS))))
-    return compare(scan, step=step, scale_mm=scale_mm)
+    return compare(scan, step=_step(scan), scale_mm=scale_mm)
 
 
 def facts(found: Comparison) -> dict[str, Any]:
@@ -58,6 +169,7 @@ def facts(found: Comparison) -> dict[str, Any]:
     light, material = found.fitted.problem.lights[0], found.fitted.problem.material
     return {
         "judged": found.judged,
+        "paint": found.paint,
         "light_direction": light.direction,
         "light_distance_mm": light.distance_mm,
         "material": vars(material),
@@ -70,22 +182,16 @@ def told(name: str, found: Comparison) -> list[str]:
     """A comparison in lines."""
     light = found.fitted.problem.lights[0]
     d = ", ".join(f"{v:.3f}" for v in light.direction)
-    lines = [f"{name}: {found.judged:.0%} of the scan judged by its picture, lamp towards {d} (scan's frame)"]
+    lines = [_judged_line(name, found), f"  lamp towards {d} (scan's frame)"]
     lines += [f"  not determined: {said}" for said in found.fitted.statements]
-    if not found.regions:
-        lines.append("  the scan explains the picture: no place contradicts it")
-    for region in found.regions[:_TOLD]:
-        x, y, z = region.middle_mm
-        lines.append(
-            f"  {region.kind} at {x:.1f}, {y:.1f}, {z:.1f} mm: {region.area_mm2:.0f} mm2, {region.length_mm:.0f} x {region.width_mm:.0f} mm, "
-            f"z {region.z:.1f}"
-        )
-    return lines
+    if not found.regions and found.judged > 0.0:
+        lines.append("  where it was judged the scan explains the picture: no place contradicts it")
+    return lines + _places(found.regions)
 
 
 def residual_picture(found: Comparison) -> FloatArray:
-    """(h, w, 3) uint8: z from -8 (black) to 8 (white), grey 0; blue where not judged."""
-    level = np.clip(found.z / 16.0 + 0.5, 0.0, 1.0)
+    """(h, w, 3) uint8: z from minus the level (black) to the level (white), grey 0; blue where not compared."""
+    level = np.clip(found.z / (2.0 * max(found.level, 1e-9)) + 0.5, 0.0, 1.0)
     grey = np.repeat((np.nan_to_num(level) * 255.0)[..., None], 3, axis=2)
     grey[~np.isfinite(found.z)] = (20, 30, 60)
     return grey.astype(np.uint8)

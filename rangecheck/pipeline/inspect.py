@@ -69,7 +69,7 @@ def check(
 
 
 def _check_scans(file: str, settings: Settings, unit: str | None, reporter: Reporter) -> tuple[dict[str, Any], list[str]]:
-    """What the scans of one path hold, whether they belong together, and what they are worth."""
+    """What the scans of one path hold, whether their pictures contradict them, whether they belong together, and what they are worth."""
     scans = read_all_scans([file], unit, reporter)
     about = [scan_facts(scan) for scan in scans]
     lines = [f"{file}: {len(scans)} readable range scans"]
@@ -81,13 +81,19 @@ def _check_scans(file: str, settings: Settings, unit: str | None, reporter: Repo
                 f"  {a['name']}: {a['width']}x{a['height']}, {a['valid']:,} distances ({a['valid_share']:.0%}), "
                 f"{a['nearest_mm']:.1f} to {a['farthest_mm']:.1f} mm, spacing {a['spacing_mm'] or 0.0:.2f} mm"
             )
-    facts: dict[str, Any] = {"file": file, "kind": "scans", "scans": about}
+    from rangecheck.pipeline.explained import pictured
+
+    seen = pictured(file, scans, settings.checking.severities, reporter)
+    lines += [f"  {line}" for line in seen.lines]
+    facts: dict[str, Any] = {
+        "file": file, "kind": "scans", "scans": about, "pictures": seen.facts, "findings": [f.to_dict() for f in seen.findings],
+    }  # fmt: skip
     try:
         ready = prepared(scans, settings, reporter, quality=settings.scan.quality)
     except PosesRefused as refusal:
         facts |= {"fit": False, "registration": refusal.measured["registration"], "quality": None}
         return facts, [*lines, *(f"  {line}" for line in refusal.measured["lines"])]
-    fit = ready.quality is None or ready.quality["verdict"] != "unfit"
+    fit = (ready.quality is None or ready.quality["verdict"] != "unfit") and all(f.severity != "error" for f in seen.findings)
     facts |= {"fit": fit, "registration": ready.registration, "filtered": ready.filtered, "quality": ready.quality}
     return facts, [*lines, *(f"  {line}" for line in ready.quality_lines)]
 

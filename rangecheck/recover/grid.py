@@ -78,20 +78,29 @@ def masked_gauss(values: FloatArray, weight: FloatArray, sigma: float) -> FloatA
 
 
 def normals_at(grid: ScanGrid, scale_mm: float) -> FloatArray:
-    """(h, w, 3) unit normals, towards the camera, of the range image smoothed at `scale_mm`; NaN where a neighbour is missing.
+    """(h, w, 3) unit normals, towards the camera, of the range image smoothed at `scale_mm`; NaN where a neighbour is missing."""
+    return turned_normals(grid, scale_mm)[0]
+
+
+def turned_normals(grid: ScanGrid, scale_mm: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(h, w, 3) unit normals, towards the camera, of the range image smoothed at `scale_mm`, NaN where a neighbour is missing; and how they turn with the
+    slopes of ln range per cell along columns and along rows.
 
     Smoothing acts on the logarithm of range after a plane's own slope, so that slanted planes keep their normals up to rims."""
     ranges = np.linalg.norm(grid.points, axis=-1)
     sigma = max(scale_mm / grid.spacing_mm, 0.5)
-    smooth = _local_planes(np.log(np.where(grid.valid, ranges, 1.0)), grid.valid, sigma)
-    level, across, down = smooth
+    level, across, down = _local_planes(np.log(np.where(grid.valid, ranges, 1.0)), grid.valid, sigma)
     by_u = _ray_slopes(grid.rays, 1) + across[..., None] * grid.rays
     by_v = _ray_slopes(grid.rays, 0) + down[..., None] * grid.rays
-    normals = unit_vectors(np.cross(by_u, by_v))
-    back = (normals * grid.rays).sum(-1) > 0
-    normals[back] *= -1.0
+    crossed = np.cross(by_u, by_v)
+    crossed[(crossed * grid.rays).sum(-1) > 0] *= -1.0
+    length = np.maximum(np.linalg.norm(crossed, axis=-1, keepdims=True), 1e-300)
+    normals = crossed / length
     normals[~grid.valid | ~np.isfinite(level)] = np.nan
-    return normals
+    # v x u looks back to the camera, as columns run right and rows down
+    turns = [np.cross(by_v, grid.rays), np.cross(grid.rays, by_u)]
+    a, b = ((turn - (turn * normals).sum(-1, keepdims=True) * normals) / length for turn in turns)
+    return normals, a, b
 
 
 def _ray_slopes(rays: FloatArray, axis: int) -> FloatArray:

@@ -23,8 +23,8 @@ import numpy as np
 from rangecheck import rigid
 from rangecheck.arrays import BoolArray, FloatArray
 from rangecheck.errors import ScanError
-from rangecheck.recover.compare import Region, inner
 from rangecheck.recover.grid import scan_grid
+from rangecheck.recover.regions import Region, inner, regions_of
 from rangecheck.scan import RangeScan
 from rangecheck.scan.decode import View
 
@@ -35,8 +35,6 @@ LEAST_MM, CHANCE = 0.15, 0.01
 #: correlation from which a window is believed, and share of a half disc that must be judged
 _CORRELATED, _FILLED = 0.85, 0.5
 _DIRECTIONS = 8
-#: regions this many times longer than wide are lines: steps between surfaces
-_LINE = 3.0
 _NORMAL_MAD = 0.6744897501960817
 
 
@@ -130,7 +128,9 @@ def _judged(
     noise = float(np.median(jump[known])) / _NORMAL_MAD if count else math.nan
     # the jump is the largest of several directions, each of either sign
     level = max(LEAST_MM, noise * NormalDist().inv_cdf(1.0 - CHANCE / (2.0 * _DIRECTIONS * places)))
-    regions = _regions(points, jump, level, noise, spacing_mm)
+    # a jump is as wide as its disc: less is the picture's grain
+    found = regions_of(np.nan_to_num(jump) > level, jump / noise, points, spacing_mm, 0.25 * math.pi * WINDOW_MM**2)
+    regions = tuple(sorted((region for region, _ in found), key=lambda region: -region.z))
     return Agreement(offset_mm, jump, noise, level, places, count / max(1, int(valid.sum())), spacing_mm, step, regions)
 
 
@@ -154,32 +154,6 @@ def jumps(values: FloatArray, radius: float) -> FloatArray:
             full &= count > _FILLED * half.sum()
         largest = np.fmax(largest, np.where(full, np.abs(means[0] - means[1]), np.nan))
     return largest
-
-
-def _regions(points: FloatArray, jump: FloatArray, level: float, noise: float, spacing_mm: float) -> tuple[Region, ...]:
-    from scipy.ndimage import label
-
-    high = np.nan_to_num(jump) > level
-    spots, count = label(high, np.ones((3, 3)))
-    found = []
-    for k in range(1, count + 1):
-        rows, columns = np.nonzero(spots == k)
-        # a jump is as wide as its disc: less is the picture's grain
-        if len(rows) * spacing_mm**2 < 0.25 * math.pi * WINDOW_MM**2:
-            continue
-        here = points[rows, columns]
-        middle = np.median(here, axis=0)
-        spread = np.linalg.svd(here - here.mean(axis=0), compute_uv=False) / math.sqrt(len(here))
-        length, width = (2.0 * math.sqrt(3.0) * float(s) for s in spread[:2])
-        worst = int(np.argmax(jump[rows, columns]))
-        found.append(
-            Region(
-                "registration" if length > _LINE * max(width, spacing_mm) else "shape",
-                (float(middle[0]), float(middle[1]), float(middle[2])), len(rows) * spacing_mm**2, length, width,
-                float(jump[rows[worst], columns[worst]]) / noise, (int(rows[worst]), int(columns[worst])),
-            )
-        )  # fmt: skip
-    return tuple(sorted(found, key=lambda region: -region.z))
 
 
 def named_cells(agreement: Agreement) -> BoolArray:

@@ -17,6 +17,7 @@ from rangecheck.arrays import FloatArray
 from rangecheck.export.mapped import coloured_map
 from rangecheck.export.pictures import png_bytes
 from rangecheck.optics import Sensor
+from rangecheck.recover.compare import compare
 from rangecheck.recover.fit import Fitted
 from rangecheck.recover.grid import ScanGrid, masked_gauss, normals_at, scan_grid
 from rangecheck.recover.lamp import lamp_of
@@ -111,6 +112,8 @@ def alexander(quick: bool) -> tuple[list[Any], list[str], list[dict[str, Any]], 
     fitted, residual, spreads = shading_explained(scan)
     light = fitted.problem.lights[0]
     towards = ", ".join(f"{v:.3f}" for v in light.direction)
+    shaded = compare(scan, step=_STEP)
+    shown = shaded.least_mm[np.isfinite(shaded.least_mm)]
     clean = second_view(scan, right, view, step=_STEP)
     points = scan_grid(scan, _STEP).points
     findings = [
@@ -118,6 +121,8 @@ def alexander(quick: bool) -> tuple[list[Any], list[str], list[dict[str, Any]], 
         f"{fitted.problem.material.K_lobe:.3f}",
         f"in structures of a dent's size the picture varies by {spreads['picture']:.1%}, the fitted shading by {spreads['shading']:.1%}, what is left by "
         f"{spreads['left']:.1%}: paint hides shape from shading alone",
+        f"by shading {shaded.judged:.0%} of the scan could be judged to 1 mm: there dents of {np.median(shown) if shown.size else math.nan:.2f} mm (median) "
+        f"would be named, from {shaded.level:.1f} sigma; {len(shaded.regions)} places named",
         f"second view: {clean.judged:.0%} of the scan judged, noise of a jump {clean.noise_mm:.3f} mm, named from {clean.level_mm:.3f} mm",
         f"unaltered scan: {len(clean.regions)} places named of {clean.places} judged discs of {DISC_MM:g} mm radius",
     ]
