@@ -39,6 +39,8 @@ LEAST_MM = 0.2
 _LEAST_COSINE, _LEAST_LIGHT, _LEAST_SEEN = 0.35, 0.25, 0.35
 #: share of the light that is mirrored, from which a place is a highlight
 _GLOSSY = 0.4
+#: of a fault's z, what its filter's side lobes may reach
+_LOBE = 0.5
 _NORMAL_MAD = 0.6744897501960817
 #: what lies further out than this many deviations is what is looked for, not what it is judged by
 _CAPPED = 3.0
@@ -89,7 +91,8 @@ def compare(scan: RangeScan, *, step: int = 1, scale_mm: float | None = None, fi
     amount = np.zeros(used.shape)
     stepped = np.zeros(used.shape, bool)
     least = np.full(used.shape, np.inf)
-    compared = inner(used, 0.5 * _RADII[0] * unit_cells)
+    # nearer to rims the slow part is the mean of one side
+    compared = inner(used, 1.5 * _RADII[0] * unit_cells)
     level = 0.0
     for radius in (r * unit_cells for r in _RADII):
         spread = scale / grid.spacing_mm
@@ -263,7 +266,13 @@ def _classed(
             # a step is a line of places that steps explain best
             kind = "registration" if stepped[at] and stepped[cells].mean() > 0.5 and region.kind == "registration" else "shape"
         found.append(replace(region, kind=kind))
-    return tuple(sorted(found, key=lambda region: -abs(region.z)))
+    # what is weaker within a filter's reach of a fault is its side lobe
+    kept: list[Region] = []
+    reach = 2.5 * _RADII[1] / _RADII[0] * least_mm
+    for region in sorted(found, key=lambda region: -abs(region.z)):
+        if all(math.dist(region.middle_mm, k.middle_mm) > reach or abs(region.z) > _LOBE * abs(k.z) for k in kept):
+            kept.append(region)
+    return tuple(kept)
 
 
 def _glossy(fitted: Fitted, shading: Shading, cell: np.ndarray, predicted: FloatArray, grid: ScanGrid) -> BoolArray:
