@@ -171,7 +171,8 @@ class _Filters:
     def relief(self, template: FloatArray, radius: float, compared: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """z, most likely amount and its standard deviation (mm) of a template (its relief per mm) about each cell."""
         d, w = self._left(radius)
-        f_v, f_u = np.gradient(_without_slow(template, radius))
+        whole = _without_slow(template, radius)
+        f_v, f_u = (np.asarray(np.gradient(whole, axis=axis)) for axis in (0, 1))
         top = _correlated(w * d * self.g_u, f_u) + _correlated(w * d * self.g_v, f_v)
         energy = _correlated(w * self.g_u**2, f_u**2) + _correlated(w * self.g_v**2, f_v**2)
         energy = np.maximum(energy + 2.0 * _correlated(w * self.g_u * self.g_v, f_u * f_v), 1e-12)
