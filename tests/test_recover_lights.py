@@ -108,6 +108,11 @@ def test_the_command_writes_a_material_with_its_uncertainty_that_other_commands_
     material = load_material(tmp_path / "ball.toml")
     # irradiance 3, so that a white surface shows 3/pi
     assert material.K_lm == pytest.approx(0.6 * math.pi / 3, rel=0.01)
+    # a picture in that material, which knows one wavelength, is grey
+    shown = ["configs/scenes/ring_on_sheet.toml", "--size", "24x20", "--material", str(tmp_path / "ball.toml")]
+    assert exit_status(["render", *shown, "-o", str(tmp_path / "ring.png"), "-q"]) == 0
+    ring = cv2.imread(str(tmp_path / "ring.png"))
+    assert ring.max() > 50 and np.array_equal(ring[..., 0], ring[..., 2])
     document = tomllib.loads((tmp_path / "ball.toml").read_text())
     low, high = document["uncertainty"]["K_lm"]
     assert low < material.K_lm < high

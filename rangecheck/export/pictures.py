@@ -75,9 +75,13 @@ def develop(radiance: FloatArray, exposure: float = 1.0, background: float = 0.0
 
 def _checked(radiance: FloatArray) -> FloatArray:
     image = np.asarray(radiance)
+    if image.ndim == 3 and image.shape[2] == 1:
+        # of one wavelength: grey
+        image = np.broadcast_to(image, (*image.shape[:2], 3))
     if image.dtype.kind != "f" or image.size == 0 or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):
         raise ArrayError(
-            f"radiance is {image.dtype} of shape {image.shape}; it must be float (h, w) or (h, w, 3), not empty", name="radiance"
+            f"radiance is {image.dtype} of shape {image.shape}; it must be float (h, w), (h, w, 1) or (h, w, 3), not empty",
+            name="radiance",
         )
     if np.isinf(image).any():
         raise ArrayError(f"radiance has {int(np.isinf(image).sum())} infinite values; no surface sends that", name="radiance")
