@@ -6,7 +6,7 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from rangecheck.studies.pictures_killed import killed_dataset_part, kills_part
+from rangecheck.studies.pictures_killed import killed_dataset_part, kills_part, whole_kills_part
 from rangecheck.studies.pictures_known import maps_part
 from rangecheck.studies.pictures_lines import drawings_part
 from rangecheck.studies.pictures_optics import cameras_part
@@ -73,6 +73,7 @@ _PARTS = {
     "turntable": _turntable_part,
     "dataset": _dataset_part,
     "kills": kills_part,
+    "whole-kills": whole_kills_part,
     "killed-dataset": killed_dataset_part,
     "maps": maps_part,
     "cameras": cameras_part,

@@ -21,7 +21,8 @@ from typing import Any
 from rangecheck.errors import DependencyMissing, InputError, RangecheckError
 from rangecheck.files import presets_folder
 
-_PATIENCE_S = 120.0
+#: without any progress for so long, a command is taken to hang
+_PATIENCE_S = 600.0
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,9 @@ def on_cluster_of_two(arguments: Sequence[str], steps: Callable[[], int], at: in
             _wait(process, steps, at)
             workers[0].kill()
             done = steps()
-            _, complaint = process.communicate(timeout=_PATIENCE_S)
+            _wait(process, steps, sys.maxsize)
+            process.kill()
+            _, complaint = process.communicate()
         finally:
             process.kill()
     if process.returncode not in (0, 1):
@@ -147,9 +150,12 @@ def command_line(arguments: Sequence[str], *, quiet: bool = True) -> list[str]:
 
 
 def _wait(process: subprocess.Popen[bytes], steps: Callable[[], int], at: int) -> None:
-    deadline = time.monotonic() + _PATIENCE_S
-    while process.poll() is None and steps() < at and time.monotonic() < deadline:
-        time.sleep(0.002)
+    moved, done = time.monotonic(), steps()
+    while process.poll() is None and done < at and time.monotonic() < moved + _PATIENCE_S:
+        time.sleep(0.01)
+        before, done = done, steps()
+        if done != before:
+            moved = time.monotonic()
 
 
 def _failed(arguments: Sequence[str], complaint: bytes) -> RangecheckError:
