@@ -166,7 +166,8 @@ class Light(Section):
     )
     samples: Annotated[int, Field(ge=1, le=1024)] = Field(
         2,
-        description="of every pixel, where the model is direct; a matt material has twice as many where its picture is uneven, and one elsewhere",
+        description="of every pixel of a turntable, where the model is direct; a matt material has twice as many where its picture is uneven, and one elsewhere; "
+        "a picture of its own has eight times as many",
     )
     tolerance_percent: Annotated[float, Field(gt=0, le=50)] = Field(
         2.0, description="of the frame's mean radiance, for plan and full"

@@ -25,6 +25,8 @@ from rangecheck.transport import Settings as LightSettings
 
 #: departure from the neighbours, relative to the mean radiance seen, from which a pixel of a matt surface gets more samples: 8 bits show less of it
 UNEVEN = 0.15
+#: samples of a picture that stands alone, over those of a turntable's frame
+STILL = 8
 
 
 def scene_of(subject: Subject, material: Material, *, direct: bool = False, stripes: bool = False) -> Scene:
@@ -51,11 +53,13 @@ def scene_of(subject: Subject, material: Material, *, direct: bool = False, stri
     return studio(surface, material, ("dark" if direct else "plaster") if matt else "steel", smooth=True, front=front)
 
 
-def plan_of(tracer: Tracer, camera: Camera, pose: FloatArray, settings: Settings) -> Plan:
-    """How the light of this picture is followed, and why so; pictures have a backdrop of their own instead of the surroundings."""
+def plan_of(tracer: Tracer, camera: Camera, pose: FloatArray, settings: Settings, *, still: bool = False) -> Plan:
+    """How the light of this picture is followed, and why so; pictures have a backdrop of their own instead of the surroundings.
+
+    A `still`, which is looked at for longer than a frame of a film, has STILL times its samples."""
     light = settings.light
     if light.model == "direct":
-        return _direct_plan(tracer.scene, light.samples)
+        return _direct_plan(tracer.scene, light.samples * (STILL if still else 1))
     plan = make_plan(tracer, camera, pose, tolerance=light.tolerance_percent / 100, model=light.model, seed=settings.seed)
     return replace(plan, settings=replace(plan.settings, backdrop=False))
 
@@ -96,7 +100,7 @@ def render(
     optics = optics_of(settings, camera, middle)
     with reporter.stage("rendering"):
         tracer = Tracer(scene_of(subject, material, direct=settings.light.model == "direct"))
-        plan = plan_of(tracer, optics.camera, pose, settings)
+        plan = plan_of(tracer, optics.camera, pose, settings, still=True)
         film, said = take(tracer, optics, pose, plan, settings.seed)
         del tracer  # of a large mesh it is far more than the picture
     exposure = settings.picture.exposure or exposure_from([film.radiance])
