@@ -6,7 +6,7 @@ from test_maps import ball
 
 from rangecheck import kernels, rigid
 from rangecheck.animation import faces_seen, measure_consistency, orbit_around, outline_of, verdict_for
-from rangecheck.animation.standing_out import Departure, departure_in, pixel_width_mm, spots, threshold_of
+from rangecheck.animation.standing_out import FALSE_PLACES, look_at_places, look_of, spots
 from rangecheck.errors import SurfaceError
 from rangecheck.maps import trace_maps
 from rangecheck.optics import PinholeCamera, Sensor
@@ -117,39 +117,50 @@ def test_the_verdict_depends_on_the_size_of_the_bust_and_on_the_printer():
         verdict_for(found, 100, 100, 0, 0.05)
 
 
-def test_a_dent_stands_out_of_its_own_picture_and_a_sound_ball_shows_nothing():
-    radius, depth_mm = 20.0, 0.1
-    sound = ball(radius, subdivisions=6)
-    top = np.array([0.0, 0.0, radius])
-    away = np.linalg.norm(sound.vertices - top, axis=1)
-    sunk = Surface(sound.vertices * (1 - depth_mm / radius * np.exp(-0.5 * away**2))[:, None], sound.faces)
-    camera = PinholeCamera.from_field_of_view(120, 120, 6.0)
-    sensor, settings = (
-        Sensor(full_well=20_000.0, read_noise=10.0),
-        Settings(passes=1, each=4, depth=1, diffuse=False, backdrop=False),
-    )
+def cap(dent_mm, radius=80.0, step=0.5, half=26.0):
+    """The top of a ball as a scan of it would be, with noise of half a micrometre, and a dent 2 mm wide in its middle."""
+    x, y = np.meshgrid(*2 * [np.arange(-half, half + step / 2, step)])
+    noise = 5e-4 * np.random.default_rng(0).normal(size=x.shape)
+    z = np.sqrt(radius**2 - x**2 - y**2) - radius + noise - dent_mm * np.exp(-0.5 * (x**2 + y**2))
+    corner = np.arange(x.size).reshape(x.shape)
+    a, b, c, d = (part.ravel() for part in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, :-1], corner[1:, 1:]))
+    return Surface(np.stack([x, y, z], -1).reshape(-1, 3), np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)]))
+
+
+def test_a_dent_stands_out_of_its_own_turntable_and_a_sound_cap_shows_nothing():
+    camera = PinholeCamera.from_field_of_view(110, 110, 7.5)
+    sensor, settings = Sensor(full_well=20_000.0, read_noise=10.0), Settings(each=4, depth=1, diffuse=False, backdrop=False)
+    poses = [rigid.look_at((400 * np.sin(a), 40, 400 * np.cos(a)), (0, 0, 0)) for a in np.radians([-30, -15, 0, 15, 30])]
     found = []
-    for surface in (sound, sunk):
-        scene = studio(surface, load_material("steel"), "stripes", smooth=True).grey()
-        found.append(spots([departure_in(scene, camera, rigid.look_at((0, 0, 400), (0, 0, 0)), settings, sensor)], 5.0))
+    for dent_mm in (0.0, 0.05):
+        scene = studio(cap(dent_mm), load_material("steel"), "stripes", smooth=True).grey()
+        looks = look_at_places(scene, camera, poses, settings, sensor, half_widths_mm=(1.0,))
+        assert np.isfinite(looks[0].threshold)
+        found.append(spots(looks))
     assert found[0] == []
-    assert len(found[1]) == 1 and np.linalg.norm(np.subtract(found[1][0].centre_mm, top)) < 3.0
+    assert len(found[1]) == 1 and np.hypot(*found[1][0].centre_mm[:2]) < 2.0
+    assert found[1][0].ratio > 1.5 * found[1][0].asked and found[1][0].by_chance < FALSE_PLACES / 10
 
 
-def test_of_places_whose_tail_falls_exponentially_as_many_stand_out_as_are_expected():
-    camera = PinholeCamera.from_field_of_view(200, 200, 25)
-    maps = trace_maps(ball(50.0, subdivisions=3), camera, rigid.look_at((0, 0, 451), (0, 0, 0)))
-    side = round(1.0 / pixel_width_mm(maps))
+def test_of_places_whose_number_falls_as_a_power_as_many_stand_out_as_are_expected():
     rng = np.random.default_rng(0)
+    points = 1e3 * rng.normal(size=(1000, 3))
 
-    def named(law, count=100):
-        values = [np.repeat(np.repeat(law(rng, (200 // side,) * 2), side, 0), side, 1) for _ in range(count)]
-        seen = [Departure(value, maps) for value in values]
-        return [(v[::side, ::side] > threshold_of([one]).sigmas).sum() for v, one in zip(values, seen)]
+    def named(ratios_of, surfaces=200):
+        return sum(len(spots([look_of(1.0, points, ratios_of())])) for _ in range(surfaces))
 
-    # 100 pictures of 0.05 expected places each are 5, and the threshold itself is told from the few largest values
-    assert 1 <= sum(named(lambda r, shape: r.exponential(size=shape))) <= 25
-    # a normal law's tail falls faster: fewer
-    assert sum(named(lambda r, shape: np.abs(r.normal(size=shape)))) <= 5
-    few = Departure(np.ones((10, 10)), maps)
-    assert threshold_of([few]).sigmas == np.inf and threshold_of([]).places == 0
+    # 200 surfaces of 0.05 expected places each are 10; a power law of places beyond 1, as one in thirteen is
+    beyond = rng.random((200, 1000)) < 1 / 13
+    law = iter(np.where(beyond, np.exp(0.2 * rng.exponential(size=beyond.shape)), 0.5))
+    assert 3 <= named(lambda: next(law)) <= 30
+    # defects do not hide themselves: three of them, each ten times what is around it
+    with_defects = iter(np.where(beyond, np.exp(0.2 * rng.exponential(size=beyond.shape)), 0.5))
+
+    def spoilt():
+        ratios = next(with_defects)
+        ratios[:3] = 10.0
+        return ratios
+
+    assert 600 <= named(spoilt) <= 630
+    few = look_of(1.0, points[:5], np.full(5, 3.0))
+    assert few.threshold == np.inf and spots([few]) == []

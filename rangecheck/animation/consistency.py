@@ -341,6 +341,6 @@ def verdict_for(
     word = "accurate enough" if fit else "not accurate enough"
     return Verdict(
         fit,
-        f"{word} for a bust of {bust_height_mm:g} mm: its noise of {noise:.3g} mm there is {'within' if fit else 'over'} the "
+        f"{word} for a bust of {bust_height_mm:.4g} mm: its noise of {noise:.3g} mm there is {'within' if fit else 'over'} the "
         f"{shown:.3g} mm that layers of {layer_mm:g} mm and pixels of {pixel_mm:g} mm can show",
     )

@@ -23,13 +23,12 @@ from rangecheck.animation import (
 from rangecheck.animation.consistency import Outline
 from rangecheck.animation.standing_out import (
     FALSE_PLACES,
-    SPOT_MM,
+    HALF_WIDTHS_MM,
+    Look,
     Spot,
-    Threshold,
-    departures_in,
+    look_at_places,
     pixel_width_mm,
     spots,
-    threshold_of,
 )
 from rangecheck.config import Settings
 from rangecheck.export.mapped import coloured_map
@@ -52,7 +51,7 @@ JUDGED = 40_000
 #: flagged places that are named
 NAMED = 10
 #: poses of the turntable, and rays through each pixel, from which places that stand out in mirrored light are looked for
-STANDING_VIEWS, STANDING_RAYS = 6, 4
+STANDING_VIEWS, STANDING_RAYS = 12, 4
 #: by a sensor of 8 bits, where the settings have none
 PLAIN_SENSOR = Sensor(full_well=20_000.0, read_noise=10.0, response="srgb")
 #: without a printer in the settings
@@ -87,34 +86,46 @@ def known_of(
 
 @dataclass(frozen=True)
 class Standing:
-    """Places where mirrored light departs from what the normals around lead to expect, and from how many sigmas on they are named."""
+    """Places where mirrored light departs from what the normals around lead to expect, and the looks at the surface that name them."""
 
     spots: tuple[Spot, ...]
-    threshold: Threshold
+    looks: tuple[Look, ...]
     views: int
     pixel_mm: float
+
+    @property
+    def places(self) -> int:
+        """How many places were judged, of all half widths."""
+        return sum(len(look.ratios) for look in self.looks)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready."""
         return {
-            "places": [vars(spot) for spot in self.spots[:NAMED]], "flagged": len(self.spots), "threshold_sigmas": self.threshold.sigmas,
-            "places_judged": self.threshold.places, "false_places_expected": FALSE_PLACES, "views": self.views, "pixel_mm": self.pixel_mm,
+            "places": [vars(spot) for spot in self.spots[:NAMED]], "flagged": len(self.spots), "places_judged": self.places,
+            "false_places_expected": FALSE_PLACES, "views": self.views, "pixel_mm": self.pixel_mm,
+            "looks": [
+                {"half_width_mm": look.half_width_mm, "threshold": look.threshold, "places": len(look.ratios), "beyond_their_surroundings": look.beyond}
+                for look in self.looks
+            ],
         }  # fmt: skip
 
     def lines(self) -> list[str]:
         """For people."""
-        if not np.isfinite(self.threshold.sigmas):
+        if not any(np.isfinite(look.threshold) for look in self.looks):
             return [
-                f"places that stand out of what they mirror: not told; pixels of {self.pixel_mm:.2g} mm leave {self.threshold.places} places to "
+                f"places that stand out of what they mirror: not told; pixels of {self.pixel_mm:.2g} mm leave {self.places} places to "
                 "compare (larger --size shows more)"
             ]
         said = [
-            f"in mirrored light {len(self.spots)} of {self.threshold.places:,} places stand out by more than {self.threshold.sigmas:.1f} sigmas, where "
-            f"{FALSE_PLACES:g} are expected of a surface whose places' tail goes on as it begins"
+            f"in mirrored light {len(self.spots)} of {self.places:,} places stand out of all that is around them, where chance would name "
+            f"{FALSE_PLACES:g}"
         ]
         for spot in self.spots[:3]:
             x, y, z = spot.centre_mm
-            said.append(f"  stands out of its surroundings at ({x:.1f}, {y:.1f}, {z:.1f}) mm by {spot.sigmas:.1f} sigmas")
+            said.append(
+                f"  stands out of its surroundings at ({x:.1f}, {y:.1f}, {z:.1f}) mm, about {2 * spot.half_width_mm:g} mm wide: {spot.ratio:.1f} times the "
+                f"most that is around it ({spot.asked:.1f} are asked)"
+            )
         return said
 
 
@@ -124,11 +135,15 @@ def standing_of(scene: Scene, camera: PinholeCamera, orbit: Orbit, sensor: Senso
     chosen = sorted({k * orbit.frames // STANDING_VIEWS for k in range(STANDING_VIEWS)})
     followed = LightSettings(passes=1, each=STANDING_RAYS, diffuse=False, depth=1, backdrop=False)
     poses = [orbit.world_from_camera(k) for k in chosen]
-    found = departures_in(scene.grey(), straight, poses, followed, sensor or PLAIN_SENSOR, seed=seed)
-    pixel = float(np.median([pixel_width_mm(one.maps) for one in found]))
-    threshold = threshold_of(found if pixel <= 2 * SPOT_MM else [])
-    named = spots(found, threshold.sigmas) if np.isfinite(threshold.sigmas) else []
-    return Standing(tuple(named), threshold, len(found), pixel)
+    pixel = pixel_width_mm(trace_maps(scene.surface, straight, poses[0], allow_inside=True))
+    # what is looked for must be at least as wide as two pixels
+    widths = [width for width in HALF_WIDTHS_MM if pixel <= width]
+    found = (
+        look_at_places(scene.grey(), straight, poses, followed, sensor or PLAIN_SENSOR, half_widths_mm=widths, seed=seed)
+        if widths
+        else []
+    )
+    return Standing(tuple(spots(found)), tuple(found), len(poses), pixel)
 
 
 def judge(
@@ -218,7 +233,7 @@ def _drawn(surface: Surface, found: Consistency, views: Sequence[Maps], standing
         shown = np.array(picture)
         top = shown.shape[0] - VIEW_PX
         rings = [(place.centre_mm, place.size_mm, 7, (0, 160, 255)) for place in found.places[:NAMED]]
-        rings += [(spot.centre_mm, 2 * SPOT_MM, 10, (40, 220, 90)) for spot in standing[:NAMED]]
+        rings += [(spot.centre_mm, 2 * spot.half_width_mm, 10, (40, 220, 90)) for spot in standing[:NAMED]]
         for centre_mm, size_mm, radius, colour in rings:
             uv, depth = maps.camera.project(_moved(maps, np.array([centre_mm])))
             column, row = (round(float(c)) for c in np.nan_to_num(uv[0], nan=-1))
