@@ -17,7 +17,7 @@ import numpy as np
 
 from rangecheck.arrays import BoolArray, FloatArray, IntArray
 from rangecheck.errors import SurfaceError
-from rangecheck.kernels import kernel
+from rangecheck.kernels import inline_kernel, kernel
 from rangecheck.raycast import direct
 
 #: a hit nearer to grazing than this sine keeps Embree's distance: the plane of the face says nothing about it
@@ -57,7 +57,7 @@ class EmbreeCaster:
         self.scale_mm = float(max((high - low).max() / 2, np.finfo(np.float32).tiny))
         self.skin = float(64 * np.spacing(np.float32(1.0)))
         self.skin_mm = self.skin * self.scale_mm
-        self.vertices = np.ascontiguousarray((vertices_mm - self.centre_mm) / self.scale_mm)
+        self._vertices_mm = np.ascontiguousarray(vertices_mm, np.float64)
         self.faces = np.ascontiguousarray(faces, dtype=np.int32)
         local = self.vertices.astype(np.float32)
         self._direct = direct.DirectScene(local, self.faces) if direct.load() is not None else None
@@ -69,6 +69,11 @@ class EmbreeCaster:
             # the acceleration structure is built at the first query, which must not happen in two threads at once
             self._scene.run(np.zeros((1, 3), np.float32), np.array([[0, 0, 1]], np.float32))
 
+    @property
+    def vertices(self) -> FloatArray:
+        """(n, 3) local, made anew each time: of a large mesh a second copy is much."""
+        return (self._vertices_mm - self.centre_mm) / self.scale_mm
+
     def closest(self, origins_mm: FloatArray, directions: FloatArray, *, coherent: bool = False) -> Hits:
         """First hit of each ray; origins and unit directions (n, 3). `coherent` rays (a picture's, row by row) go faster."""
         n = len(origins_mm)
@@ -79,7 +84,7 @@ class EmbreeCaster:
         self.closest_local(origins, rays, far, hits.face, hits.u, hits.v, coherent=coherent)
         _distances(
             np.ascontiguousarray(origins_mm, np.float64), np.ascontiguousarray(directions, np.float64), self.centre_mm,
-            self.scale_mm, self.vertices, self.faces, skip, far, hits.face, hits.distance_mm,
+            self.scale_mm, self._vertices_mm, self.faces, skip, far, hits.face, hits.distance_mm,
         )  # fmt: skip
         return hits
 
@@ -159,17 +164,28 @@ def _approach(origins_mm, directions, reach_mm, centre_mm, scale_mm, origins, ra
         far[i] = max(left, 0.0) if left < 1e30 else np.inf
 
 
+@inline_kernel
+def _local(vertices_mm, i, centre_mm, scale_mm):
+    """Vertex i in the local frame."""
+    return (
+        (vertices_mm[i, 0] - centre_mm[0]) / scale_mm,
+        (vertices_mm[i, 1] - centre_mm[1]) / scale_mm,
+        (vertices_mm[i, 2] - centre_mm[2]) / scale_mm,
+    )
+
+
 @kernel
-def _distances(origins_mm, directions, centre_mm, scale_mm, vertices, faces, skip, far, face, distance_mm):
+def _distances(origins_mm, directions, centre_mm, scale_mm, vertices_mm, faces, skip, far, face, distance_mm):
     """Lengths from the origins to the planes of the faces that were hit, in float64."""
     for i in range(len(face)):
         if face[i] < 0:
             distance_mm[i] = np.inf
             continue
         a, b, c = faces[face[i], 0], faces[face[i], 1], faces[face[i], 2]
-        ax, ay, az = vertices[a, 0], vertices[a, 1], vertices[a, 2]
-        px, py, pz = vertices[b, 0] - ax, vertices[b, 1] - ay, vertices[b, 2] - az
-        qx, qy, qz = vertices[c, 0] - ax, vertices[c, 1] - ay, vertices[c, 2] - az
+        ax, ay, az = _local(vertices_mm, a, centre_mm, scale_mm)
+        bx, by, bz = _local(vertices_mm, b, centre_mm, scale_mm)
+        cx, cy, cz = _local(vertices_mm, c, centre_mm, scale_mm)
+        px, py, pz, qx, qy, qz = bx - ax, by - ay, bz - az, cx - ax, cy - ay, cz - az
         nx, ny, nz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
         size = np.sqrt(nx * nx + ny * ny + nz * nz)
         across = nx * directions[i, 0] + ny * directions[i, 1] + nz * directions[i, 2]
