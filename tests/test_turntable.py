@@ -14,7 +14,7 @@ from rangecheck.export.meshes import write_mesh
 from rangecheck.modeler.primitives import sphere
 from rangecheck.surface import Surface
 
-TURN = ["--unit", "mm", "--frames", "40", "--size", "48x48", "-q"]
+TURN = ["--unit", "mm", "--frames", "60", "--size", "160x160", "-q"]
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def test_a_stopped_turntable_exits_130_and_goes_on_to_the_same_bytes(ball, undis
     command = [sys.executable, "-m", "rangecheck_cli", "turntable", str(ball), "-o", str(film), *TURN]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 120
-    while not (frames / "frame_0003.png").exists() and process.poll() is None and time.monotonic() < deadline:
+    while not (frames / "frame_0000.png").exists() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.01)
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=60)
@@ -48,7 +48,7 @@ def test_a_stopped_turntable_exits_130_and_goes_on_to_the_same_bytes(ball, undis
     assert "interrupted" in said
     assert not film.exists()
     finished = json.loads((frames / "frames.json").read_text())["done"]
-    assert 0 < len(finished) < 40
+    assert 0 < len(finished) < 60
     assert exit_status(["turntable", str(ball), "-o", str(film), *TURN]) == 0
     assert film.read_bytes() == undisturbed
 

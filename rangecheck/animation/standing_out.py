@@ -6,7 +6,8 @@ cubic changes of slope (twice the mean less the mean of the mean). How far the p
 the sensor's noise, is gathered on the surface from all poses that see a place, as stripes and highlights pass over each place in
 some of them only; its mean magnitude is proportional to the slope that departs, as long as a stripe moves by less than its width.
 
-A place stands out by the ratio of this to the strongest of SECTORS sectors of the ring around it: ordered statistics keep the rate of
+A place stands out by the ratio of this to the strongest of SECTORS sectors of a ring around it: the nearer of two, which knows its
+clutter best, or the farther, into which a deep defect does not spill (what it does to the averaged normals reaches 6 half widths). Ordered statistics keep the rate of
 false alarms where clutter is uneven (Rohling, Radar CFAR thresholding in clutter and multiple target situations, 1983). Folds and
 edges go on into the ring and do not stand out; a dent ends before it. Of places like all others one in SECTORS + 1 passes 1; how
 their number falls with the ratio is told from the surface's own places, and says how many would reach a ratio by chance.
@@ -30,9 +31,9 @@ from rangecheck.transport import Settings, Tracer
 
 #: half widths of what is looked for, mm
 HALF_WIDTHS_MM = (1.0, 2.0)
-#: in half widths: normals are averaged over SMOOTH, departures over SPOT (standard deviations); the ring reaches from RING[0] to RING[1],
-#: and places lie APART
-SMOOTH, SPOT, RING, APART = 2.0, 0.5, (3.0, 6.0), 2.0
+#: in half widths: normals are averaged over SMOOTH, departures over SPOT (standard deviations); where the rings begin and end; and how
+#: far places lie APART
+SMOOTH, SPOT, RINGS, APART = 2.0, 0.5, ((3.0, 6.0), (6.0, 9.0)), 2.0
 ORDER = 2
 SECTORS, FILLED = 12, 9
 #: surfaces turned further away than this are not judged
@@ -183,14 +184,15 @@ def _look(surface: Surface, half_width_mm: float, departed: FloatArray, pixels: 
     places = _highest_around(surface, level, APART * half_width_mm)
     if not len(places):
         return look_of(half_width_mm, np.empty((0, 3)), np.empty(0), looks)
-    around = _sectors_around(surface, level, judged, places, [r * half_width_mm for r in RING])
-    whole = (around >= 0).sum(axis=1) >= FILLED
-    places, around = places[whole], around[whole]
+    around = _sectors_around(surface, level, judged, places, np.multiply(RINGS, half_width_mm))
+    whole = (around >= 0).sum(axis=2) >= FILLED
+    strongest = np.where(whole, around.max(axis=2, initial=0.0), np.inf).min(axis=1)
+    places, strongest = places[np.isfinite(strongest)], strongest[np.isfinite(strongest)]
     # magnitudes of n pixels' noise average to a standard deviation of sqrt((1 - 2 / pi) / n)
     area = float(surface.face_areas.sum()) / len(surface.vertices)
     averaged = float(np.median(density[judged])) / area * 4 * math.pi * spot_mm**2
     quiet = QUIET * math.sqrt((1 - 2 / math.pi) / max(averaged, 1.0))
-    ratios = (level[places] + quiet) / (around.max(axis=1, initial=0.0) + quiet)
+    ratios = (level[places] + quiet) / (strongest + quiet)
     return look_of(half_width_mm, surface.vertices[places], ratios, looks)
 
 
@@ -238,24 +240,24 @@ def _highest_around(surface: Surface, level: FloatArray, apart_mm: float) -> Int
     return np.array(chosen, np.int64)
 
 
-def _sectors_around(
-    surface: Surface, level: FloatArray, judged: BoolArray, places: IntArray, ring_mm: Sequence[float]
-) -> FloatArray:
-    """(k, SECTORS) the highest level in each sector of the ring around each place, -1 where nothing of it is judged."""
+def _sectors_around(surface: Surface, level: FloatArray, judged: BoolArray, places: IntArray, rings_mm: FloatArray) -> FloatArray:
+    """(k, rings, SECTORS) the highest level in each sector of the rings around each place, -1 where nothing of it is judged."""
     from scipy.spatial import cKDTree
 
     where, known = surface.vertices[judged], level[judged]
     tree = cKDTree(where)
-    found = np.full((len(places), SECTORS), -1.0)
+    found = np.full((len(places), len(rings_mm), SECTORS), -1.0)
     for start in range(0, len(places), 1024):
         some = places[start : start + 1024]
-        for row, (vertex, near) in enumerate(zip(some, tree.query_ball_point(surface.vertices[some], ring_mm[1])), start):
+        for row, (vertex, near) in enumerate(zip(some, tree.query_ball_point(surface.vertices[some], rings_mm.max())), start):
             who = np.array(near, np.int64)
             away = where[who] - surface.vertices[vertex]
             u, v = _tangents(surface.vertex_normals[vertex])
             sector = ((np.arctan2(away @ v, away @ u) / (2 * math.pi) + 1.0) * SECTORS).astype(np.int64) % SECTORS
-            in_ring = np.linalg.norm(away, axis=1) > ring_mm[0]
-            np.maximum.at(found[row], sector[in_ring], known[who[in_ring]])
+            reach = np.linalg.norm(away, axis=1)
+            for ring, (begins, ends) in zip(found[row], rings_mm):
+                inside = (reach > begins) & (reach <= ends)
+                np.maximum.at(ring, sector[inside], known[who[inside]])
     return found
 
 
@@ -283,7 +285,7 @@ def spots(looks: Sequence[Look], false_places: float = FALSE_PLACES) -> list[Spo
                 found.append(Spot((x, y, z), look.half_width_mm, float(ratio), look.threshold, by_chance))
     kept: list[Spot] = []
     for spot in sorted(found, key=lambda spot: (spot.by_chance, spot.centre_mm)):
-        reach = RING[0] * spot.half_width_mm
-        if all(math.dist(spot.centre_mm, other.centre_mm) > max(reach, RING[0] * other.half_width_mm) for other in kept):
+        reach = RINGS[0][0] * spot.half_width_mm
+        if all(math.dist(spot.centre_mm, other.centre_mm) > max(reach, RINGS[0][0] * other.half_width_mm) for other in kept):
             kept.append(spot)
     return kept
