@@ -129,11 +129,13 @@ class Farm:
         return frames
 
     def _sent(self, job: J) -> Any:
-        """The job on every worker that there is now; workers may be lost while it travels."""
+        """The job on one worker, from which each other fetches it once when its first frame is asked for; workers may be lost while it
+        travels. Not on all at once: while it replicates what is scattered, the scheduler tries a lost worker for ever
+        (distributed 2026.8)."""
         for attempt in range(LOST_WORKERS):
             self._need_workers()
             try:
-                return self.client.scatter(job, broadcast=True, hash=False)
+                return self.client.scatter(job, hash=False)
             except (OSError, TimeoutError) as error:
                 lost = error
                 time.sleep(0.1 * 2**attempt)
