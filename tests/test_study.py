@@ -23,7 +23,7 @@ from rangecheck.study import (
     study_of_parts,
     write_study,
 )
-from rangecheck.study.charts import draw
+from rangecheck.study.drawing import draw
 from rangecheck.study.memory import run_watched
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from rangecheck.arrays import FloatArray, IntArray
 from rangecheck.errors import DependencyMissing, SceneError
-from rangecheck.modeler.primitives import Body
+from rangecheck.modeler.body import Body
 
 OPERATIONS = ("union", "difference", "intersection")
 

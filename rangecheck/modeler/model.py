@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from rangecheck.arrays import FloatArray, IntArray
-from rangecheck.modeler.primitives import Body
+from rangecheck.modeler.body import Body
 from rangecheck.modeler.true_faces import TrueFace
 from rangecheck.optics import PinholeCamera
 from rangecheck.surface import MEASURED, Surface

@@ -8,37 +8,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 
 from rangecheck import rigid
 from rangecheck.arrays import FloatArray, IntArray
 from rangecheck.errors import SceneError
+from rangecheck.modeler.body import Body
+from rangecheck.modeler.engine import triangulate
 from rangecheck.modeler.profiles import Segment, arc_chords, segments
 from rangecheck.modeler.true_faces import TrueFace
-
-
-@dataclass(frozen=True, eq=False)
-class Body:
-    """Triangles with numbered faces: vertices (n, 3), faces (m, 3), label (m,) index into names and true_faces."""
-
-    vertices: FloatArray = field(repr=False)
-    faces: IntArray = field(repr=False)
-    label: IntArray = field(repr=False)
-    names: tuple[str, ...]
-    true_faces: tuple[TrueFace, ...]
-
-    def moved(self, motion: FloatArray) -> Body:
-        """The body after a rigid motion."""
-        return Body(
-            rigid.move_points(motion, self.vertices),
-            self.faces,
-            self.label,
-            self.names,
-            tuple(f.moved(motion) for f in self.true_faces),
-        )
-
 
 #: no body is cut into more facets than this: a scene that needs more has a tolerance that nobody can see
 MOST_FACETS = 1_000_000
@@ -218,8 +197,6 @@ def _revolved_face(s: Segment) -> TrueFace:
 
 def extruded(points: Sequence[Sequence[float]], names: Sequence[str], depth_mm: float, error_mm: float, name: str) -> Body:
     """The solid of an outline in (x, y) between z = -depth/2 and depth/2: faces names[k] for segment k, then `front` (+z), `back`."""
-    from rangecheck.modeler.engine import triangulate
-
     outline = segments(points, name)
     order = _names_of(points, outline, names)
     start = np.concatenate([s.chords(error_mm) for s in outline])

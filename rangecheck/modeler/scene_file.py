@@ -31,9 +31,9 @@ from rangecheck.arrays import FloatArray
 from rangecheck.errors import SceneError
 from rangecheck.files import read_toml
 from rangecheck.modeler import primitives
+from rangecheck.modeler.body import Body
 from rangecheck.modeler.engine import OPERATIONS, combine, common_volume_mm3
 from rangecheck.modeler.model import Lamp, Model, model_of
-from rangecheck.modeler.primitives import Body
 from rangecheck.modeler.true_faces import TrueFace
 from rangecheck.optics import PinholeCamera
 

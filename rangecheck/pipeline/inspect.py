@@ -8,17 +8,13 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from rangecheck.config import Settings
 from rangecheck.errors import InputError, PosesRefused
 from rangecheck.files import sha256
 from rangecheck.pipeline.outcome import Outcome, document
-from rangecheck.pipeline.preparing import Measured, prepared
-from rangecheck.pipeline.shape import findings_lines
+from rangecheck.pipeline.preparing import prepared, scan_facts
 from rangecheck.pipeline.subject import holds_scans, read_all_scans
 from rangecheck.progress import Reporter
-from rangecheck.scan.point_cloud import PointCloud
 from rangecheck.solid.findings import catalogue
 from rangecheck.solid.findings import explain as explain_code
 from rangecheck.solid.opinions import Opinion
@@ -62,7 +58,7 @@ def check(
         )
         lines.append(f"{file}:")
         lines += [f"  {note}" for note in checked.file.notes]
-        lines += [f"  {line}" for line in findings_lines(checked.verdict)]
+        lines += [f"  {line}" for line in checked.verdict.lines()]
         lines += [f"  {_word_of(opinion)}" for opinion in checked.opinions]
     fit = all(result["fit"] for result in results)
     return Outcome(document("check", fit=fit, files=results, seconds=reporter.seconds), lines, fit)
@@ -105,31 +101,6 @@ def _word_of(opinion: Opinion) -> str:
     return (
         f"{opinion.program:<10} {said}" + (f" ({counted})" if counted else "") + (f": {opinion.error}" if opinion.error else "")
     )
-
-
-def scan_facts(scan: Measured) -> dict[str, Any]:
-    """What a scan holds, in numbers; `camera` is None for a cloud."""
-    if isinstance(scan, PointCloud):
-        return {"name": scan.name, "camera": None, "unit": scan.unit, "valid": len(scan.points_mm), "valid_share": 1.0}
-    ranges = scan.range_mm[scan.valid]
-    points = scan.grid_points_mm
-    with np.errstate(invalid="ignore"):
-        steps = [np.linalg.norm(np.diff(points, axis=axis), axis=2).ravel() for axis in (0, 1)]
-    between = np.concatenate(steps)
-    return {
-        "name": scan.name,
-        "width": scan.camera.width,
-        "height": scan.camera.height,
-        "camera": scan.camera.model,
-        "unit": scan.unit,
-        "valid": int(scan.valid.sum()),
-        "valid_share": float(scan.valid.mean()),
-        "nearest_mm": float(ranges.min()),
-        "farthest_mm": float(ranges.max()),
-        "spacing_mm": float(np.nanmedian(between)) if np.isfinite(between).any() else None,
-        "noise_mm": scan.noise_mm,
-        "brightness": scan.brightness is not None,
-    }
 
 
 def explain(code: str | None) -> Outcome:

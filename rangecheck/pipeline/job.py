@@ -26,12 +26,11 @@ from rangecheck.files import write_bytes, write_json
 from rangecheck.pipeline.consistency import Known, judge, known_of, write_consistency
 from rangecheck.pipeline.folder import check_free, job_folder, key_of
 from rangecheck.pipeline.health import versions
-from rangecheck.pipeline.inspect import scan_facts
 from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.page import contours_of, keep_for_report, page_of
-from rangecheck.pipeline.preparing import Prepared, prepared
+from rangecheck.pipeline.preparing import Prepared, prepared, scan_facts
 from rangecheck.pipeline.scanning import refused
-from rangecheck.pipeline.shape import findings_lines, solid_of, standing_of
+from rangecheck.pipeline.shape import solid_of, standing_of
 from rangecheck.pipeline.subject import Subject, eye_of, hashes, read_all_scans, surface_of
 from rangecheck.pipeline.together import sentence_of, verdicts_of
 from rangecheck.pipeline.turning import Rendered, render_turntable
@@ -151,7 +150,7 @@ def _made(
     write_json(folder / FINISHED, content)
     lines = [
         *ready.quality_lines[1:2],
-        *findings_lines(judged),
+        *judged.lines(),
         f"bust.stl: {stl['faces']:,} faces, read back and checked" if stl else "no STL: the findings above hold it back",
         f"look at {folder / 'report.html'}",
     ]

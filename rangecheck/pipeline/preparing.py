@@ -7,6 +7,8 @@ from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
+
 from rangecheck.config import Settings
 from rangecheck.errors import PosesRefused, ScanError, SettingError
 from rangecheck.kernels import in_chunks
@@ -209,3 +211,28 @@ def _by_view(found: Any) -> list[str]:
         + ("" if v.overlap != v.overlap else f", {v.overlap:.0%} confirmed by others")
         for v in found.views
     ]
+
+
+def scan_facts(scan: Measured) -> dict[str, Any]:
+    """What a scan holds, in numbers; `camera` is None for a cloud."""
+    if isinstance(scan, PointCloud):
+        return {"name": scan.name, "camera": None, "unit": scan.unit, "valid": len(scan.points_mm), "valid_share": 1.0}
+    ranges = scan.range_mm[scan.valid]
+    points = scan.grid_points_mm
+    with np.errstate(invalid="ignore"):
+        steps = [np.linalg.norm(np.diff(points, axis=axis), axis=2).ravel() for axis in (0, 1)]
+    between = np.concatenate(steps)
+    return {
+        "name": scan.name,
+        "width": scan.camera.width,
+        "height": scan.camera.height,
+        "camera": scan.camera.model,
+        "unit": scan.unit,
+        "valid": int(scan.valid.sum()),
+        "valid_share": float(scan.valid.mean()),
+        "nearest_mm": float(ranges.min()),
+        "farthest_mm": float(ranges.max()),
+        "spacing_mm": float(np.nanmedian(between)) if np.isfinite(between).any() else None,
+        "noise_mm": scan.noise_mm,
+        "brightness": scan.brightness is not None,
+    }

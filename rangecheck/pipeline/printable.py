@@ -7,12 +7,19 @@ from typing import Any
 import numpy as np
 
 from rangecheck.config import Settings
+from rangecheck.config.schema import Solidify
 from rangecheck.pipeline.outcome import document
-from rangecheck.pipeline.shape import findings_lines, printer_of
 from rangecheck.solid import Solid
+from rangecheck.solid.printer import Printer, printer
 
 #: orientations that are printed
 SHOWN = 5
+
+
+def printer_of(wanted: Solidify) -> Printer | None:
+    """The profile that the part is judged for, if one was named."""
+
+    return printer(wanted.printer) if wanted.printer else None
 
 
 def printing_of(solid: Solid, settings: Settings, *, orient: bool) -> tuple[dict[str, Any], list[str]]:
@@ -39,7 +46,7 @@ def printing_of(solid: Solid, settings: Settings, *, orient: bool) -> tuple[dict
     lines = [
         f"on {profile.name}: {facts['footprint_mm'][0]:.1f} x {facts['footprint_mm'][1]:.1f} x {facts['height_mm']:.1f} mm, {facts['layers']} layers, "
         f"{facts['volume_mm3'] / 1000:.1f} ml, {facts['mass_g']:.1f} g{cost}, largest layer {facts['peak_section_mm2']:.0f} mm2",
-        *(line for line in findings_lines(judged)[1:]),
+        *(line for line in judged.lines()[1:]),
     ]
     content: dict[str, Any] = {"printing": document("printing", **judged.to_dict())} | {"fit": judged.fit}
     if orient:

@@ -14,6 +14,7 @@ from rangecheck.files import write_json
 from rangecheck.pipeline.folder import check_writable
 from rangecheck.pipeline.health import versions
 from rangecheck.pipeline.outcome import Outcome, document
+from rangecheck.pipeline.printable import printer_of, printing_of
 from rangecheck.pipeline.subject import eye_of, hashes, read_subject
 from rangecheck.progress import Reporter
 from rangecheck.rigid import inverse
@@ -21,7 +22,6 @@ from rangecheck.solid import Solid, Verdict, check_solid, choose_base_height, un
 from rangecheck.solid.base import UP, trimmed
 from rangecheck.solid.closing import Closed, close_surface
 from rangecheck.solid.hollow import Hollow, hollow
-from rangecheck.solid.printer import Printer
 from rangecheck.surface import ORIGIN_NAMES, Surface
 from rangecheck.surface.standing import file_from_scans
 
@@ -177,13 +177,6 @@ def _scaled(surface: Surface, height_mm: float, reporter: Reporter) -> Surface:
     return replace(surface, vertices=(surface.vertices - low) * scale, vertex_error_mm=None if error is None else error * scale)
 
 
-def printer_of(wanted: Solidify) -> Printer | None:
-    """The profile that the part is judged for, if one was named."""
-    from rangecheck.solid.printer import printer
-
-    return printer(wanted.printer) if wanted.printer else None
-
-
 def _simplified(surface: Surface, made: Made, wanted: Solidify, reporter: Reporter) -> Surface:
     from rangecheck.solid.simplify import printable_error_mm, simplify
 
@@ -235,7 +228,6 @@ def solid(
     """A solid of what is in `path`, written to `out` (STL, 3MF, PLY, GLB, OBJ, OFF by its ending) when it is one, with a JSON beside it that
     says where it came from; otherwise the findings that stand against it. `force_open` writes what is no solid all the same."""
     from rangecheck.export.meshes import SUFFIXES, write_mesh
-    from rangecheck.pipeline.printable import printing_of
     from rangecheck.solid.slicer import weld_distance_mm, weld_findings
 
     if Path(out).suffix.lower() not in SUFFIXES:
@@ -251,7 +243,7 @@ def solid(
     subject = read_subject(path, settings, unit, reporter)
     made = make_solid(subject.surface, settings, reporter, eye_of(subject.scans))
     lines, said = _story(made)
-    lines += findings_lines(made.verdict)
+    lines += made.verdict.lines()
     shares = {"parts": _areas(made.surface), "origins": {n: made.surface.share_of_area(k) for k, n in enumerate(ORIGIN_NAMES)}}
     content = document(
         "solid", output=None, solid=made.solid is not None, fit=made.solid is not None, verdict=made.verdict.to_dict(), **said, areas=shares,
@@ -356,17 +348,3 @@ def _write_plugs(made: Made, out: str, force: bool, stand: bool) -> list[str]:
         write_mesh(plug, path, force=force, stand=stand)
         paths.append(str(path))
     return paths
-
-
-def findings_lines(verdict: Verdict) -> list[str]:
-    """A verdict for people: the sentence, then each finding with a place and what mends it."""
-    lines = [verdict.sentence()]
-    for found in verdict.findings:
-        place = ""
-        if len(found.places_mm):
-            place = (
-                " at " + ", ".join(f"{x:.2f}" for x in found.places_mm[0]) + " mm" + (" and elsewhere" if found.count > 1 else "")
-            )
-        lines.append(f"  {found.severity:<8} {found.code}: {found.message}{place}")
-        lines.append(f"           mend: {found.mend}")
-    return lines

@@ -156,6 +156,22 @@ class Verdict:
         word = "solid, but not fit: " if all(f.code in ABOUT_SCANS for f in self.errors) else "not solid: "
         return word + "; ".join(f.message for f in self.errors)
 
+    def lines(self) -> list[str]:
+        """For people: the sentence, then each finding with a place and what mends it."""
+        lines = [self.sentence()]
+        for found in self.findings:
+            place = ""
+            if len(found.places_mm):
+                place = (
+                    " at "
+                    + ", ".join(f"{x:.2f}" for x in found.places_mm[0])
+                    + " mm"
+                    + (" and elsewhere" if found.count > 1 else "")
+                )
+            lines.append(f"  {found.severity:<8} {found.code}: {found.message}{place}")
+            lines.append(f"           mend: {found.mend}")
+        return lines
+
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready."""
         return {

@@ -21,7 +21,7 @@ from rangecheck.reflectance import GREY_UM, load_material
 from rangecheck.scene import Scene, Source
 from rangecheck.studies.scenes import RADIUS_MM, ball, bust_relief, floor, view
 from rangecheck.study import EdgeChart, Line, LineChart, Part, find_edge
-from rangecheck.study.result import Chart
+from rangecheck.study.charts import Chart
 from rangecheck.surface import Surface
 from rangecheck.surface.surface import join
 from rangecheck.transport import Settings, Tracer

@@ -22,8 +22,8 @@ from rangecheck.solid.engine import united
 from rangecheck.solid.repair import repair
 from rangecheck.solid.solid import check_solid
 from rangecheck.study import Candidate, EdgeChart, SpeedChart, find_edge, measure
+from rangecheck.study.charts import Chart
 from rangecheck.study.parts import Part, study_of_parts
-from rangecheck.study.result import Chart
 from rangecheck.surface.distance import SurfaceDistance
 from rangecheck.surface.mesh_files import read_mesh
 from rangecheck.surface.surface import Surface, join

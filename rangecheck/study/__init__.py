@@ -1,8 +1,9 @@
 """Speed against accuracy, and stability: takes callables, knows no stage. Definitions of studies live in `rangecheck.studies`."""
 
+from rangecheck.study.charts import EdgeChart, Line, LineChart, SpeedChart
 from rangecheck.study.machine import describe_machine
 from rangecheck.study.parts import Part, peak_memory_mb, study_of_parts
-from rangecheck.study.result import EdgeChart, Line, LineChart, SpeedChart, Study, write_study
+from rangecheck.study.result import Study, write_study
 from rangecheck.study.speed import Candidate, Measurement, measure, pareto_front
 from rangecheck.study.stability import Edge, find_edge
 

@@ -10,8 +10,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rangecheck.errors import SettingError
+from rangecheck.study.charts import Chart
 from rangecheck.study.machine import describe_machine
-from rangecheck.study.result import Chart, Study
+from rangecheck.study.result import Study
 
 
 @dataclass(frozen=True)

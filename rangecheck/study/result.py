@@ -9,67 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from rangecheck.files import write_bytes, write_json
+from rangecheck.study.charts import Chart, EdgeChart, LineChart, SpeedChart
+from rangecheck.study.drawing import draw
 from rangecheck.study.machine import describe_machine
-from rangecheck.study.speed import Measurement, pareto_front
-from rangecheck.study.stability import Edge
+from rangecheck.study.speed import pareto_front
 
 SCHEMA = "rangecheck/study/1"
-
-
-@dataclass(frozen=True)
-class SpeedChart:
-    """Error against time. `work` divides the seconds (evaluations, rays, pixels ...), `scale` turns them into `time_label`'s unit."""
-
-    slug: str
-    title: str
-    error_label: str
-    time_label: str
-    measurements: Sequence[Measurement]
-    work: float = 1.0
-    scale: float = 1.0
-
-    def times(self, m: Measurement) -> tuple[float, float, float]:
-        """(lower quartile, median, upper quartile) in the chart's unit."""
-        by = self.scale / self.work
-        return m.quartiles[0] * by, m.seconds * by, m.quartiles[1] * by
-
-
-@dataclass(frozen=True)
-class EdgeChart:
-    """Error against a knob, with the bound and the edges found. `log` names the logarithmic axes: any of x and y."""
-
-    slug: str
-    title: str
-    knob_label: str
-    error_label: str
-    edges: Sequence[Edge]
-    log: str = "xy"
-
-
-@dataclass(frozen=True)
-class Line:
-    """A named curve; `marked` points are drawn as dots."""
-
-    label: str
-    x: Sequence[float]
-    y: Sequence[float]
-    marked: bool = False
-
-
-@dataclass(frozen=True)
-class LineChart:
-    """Curves that belong to neither of the other two kinds. `level` draws a horizontal line at a value that matters."""
-
-    slug: str
-    title: str
-    x_label: str
-    y_label: str
-    lines: Sequence[Line]
-    log: str = ""
-    level: float | None = None
-
-
-Chart = SpeedChart | EdgeChart | LineChart
 
 
 @dataclass(frozen=True)
@@ -135,8 +80,6 @@ def write_study(study: Study, folder: str | Path, *, force: bool = True) -> list
     """Write <name>.json and every chart as <name>-<slug>.svg and .png into `folder`; returns the paths, the JSON first.
 
     Raises OutputError where the folder cannot be written, or a file exists and `force` is False."""
-    from rangecheck.study.charts import draw
-
     folder = Path(folder)
     written = [folder / f"{study.name}.json"]
     write_json(written[0], study.document(), force=force)

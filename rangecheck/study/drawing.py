@@ -1,0 +1,124 @@
+"""Drawing of a study's charts: axes with units, one colour per method, the machine at the foot. Same numbers, same bytes."""
+
+from __future__ import annotations
+
+import io
+import math
+from typing import Any
+
+from rangecheck.study.charts import Chart, EdgeChart, LineChart, SpeedChart
+from rangecheck.study.machine import machine_line
+from rangecheck.study.speed import pareto_front
+
+#: Okabe and Ito's eight colours, told apart by nearly everybody; black last
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C6D1F", "#000000")
+_MARKERS = "osD^vPX*"
+
+
+def draw(chart: Chart, machine: dict[str, Any], kind: str = "svg") -> bytes:
+    """The chart as the bytes of an SVG or PNG picture."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    style: Any = {
+        "svg.hashsalt": "rangecheck", "svg.fonttype": "path", "font.family": "DejaVu Sans", "font.size": 9.5, "axes.grid": True,
+        "grid.alpha": 0.3, "axes.spines.top": False, "axes.spines.right": False, "legend.frameon": False,
+    }  # fmt: skip
+    with mpl.rc_context(style):
+        figure = Figure(figsize=(8.0, 5.2), dpi=120, layout="constrained")
+        axes = figure.add_subplot()
+        if isinstance(chart, SpeedChart):
+            _draw_speed(axes, chart)
+        elif isinstance(chart, EdgeChart):
+            _draw_edges(axes, chart)
+        else:
+            _draw_lines(axes, chart)
+        axes.set_title(chart.title, loc="left", fontsize=11)
+        figure.supxlabel(machine_line(machine), fontsize=7, color="0.45", x=0.99, ha="right")
+        with io.BytesIO() as stream:
+            metadata = {"Date": None} if kind == "svg" else {"Software": None}
+            figure.savefig(stream, format=kind, metadata=metadata)
+            return stream.getvalue()
+
+
+def _draw_speed(axes: Any, chart: SpeedChart) -> None:
+    methods = list(dict.fromkeys(m.method for m in chart.measurements))
+    drawn = [m for m in chart.measurements if math.isfinite(m.error)]
+    positive = [m.error for m in drawn if m.error > 0]
+    floor = 0.3 * min(positive) if positive else 1e-17
+    for index, method in enumerate(methods):
+        own = [m for m in drawn if m.method == method]
+        colour, marker = _COLOURS[index % len(_COLOURS)], _MARKERS[index % len(_MARKERS)]
+        x = [chart.times(m)[1] for m in own]
+        y = [max(m.error, floor) for m in own]
+        spread = [[chart.times(m)[1] - chart.times(m)[0] for m in own], [chart.times(m)[2] - chart.times(m)[1] for m in own]]
+        axes.errorbar(x, y, xerr=spread, fmt=marker, color=colour, capsize=2, label=method, linewidth=1)
+        for m, px, py in zip(own, x, y):
+            if m.setting:
+                axes.annotate(m.setting, (px, py), textcoords="offset points", xytext=(6, 5), fontsize=8, color=colour)
+    front = pareto_front(chart.measurements)
+    axes.step(
+        [chart.times(m)[1] for m in front], [max(m.error, floor) for m in front],
+        where="post", color="0.5", linewidth=1, linestyle="--", zorder=0, label="not beaten in both",
+    )  # fmt: skip
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_xlabel(f"{chart.time_label}; median, bars are quartiles")
+    axes.set_ylabel(chart.error_label)
+    axes.legend(loc="best", fontsize=8.5)
+
+
+def _draw_edges(axes: Any, chart: EdgeChart) -> None:
+    bounds = sorted({edge.bound for edge in chart.edges})
+    for index, edge in enumerate(chart.edges):
+        colour = _COLOURS[index % len(_COLOURS)]
+        words = _edge_label(edge)
+        # what cannot be drawn leaves a gap: a line across it would be a claim
+        heights = [e if math.isfinite(e) and (e > 0 or "y" not in chart.log) else math.nan for e in edge.errors]
+        axes.plot(edge.knobs, heights, color=colour, linewidth=1.5, marker=".", markersize=3, label=words)
+        if edge.breaks_at is not None and edge.holds_at is not None:
+            axes.plot([edge.breaks_at], [edge.bound], marker="o", color=colour, markersize=6, zorder=5)
+    for bound in bounds:
+        axes.axhline(bound, color="#b03030", linewidth=1, linestyle="--")
+        axes.annotate(
+            f"bound {bound:g}",
+            (1.0, bound),
+            xycoords=("axes fraction", "data"),
+            ha="right",
+            va="bottom",
+            color="#b03030",
+            fontsize=8,
+        )
+    _scales(axes, chart.log)
+    axes.set_xlabel(chart.knob_label)
+    axes.set_ylabel(chart.error_label)
+    axes.legend(loc="best", fontsize=8.5)
+
+
+def _edge_label(edge: Any) -> str:
+    if edge.breaks_at is None:
+        return f"{edge.method}: holds throughout"
+    if edge.holds_at is None:
+        return f"{edge.method}: broken from the start"
+    return f"{edge.method}: breaks at {edge.breaks_at:.4g}"
+
+
+def _draw_lines(axes: Any, chart: LineChart) -> None:
+    for index, line in enumerate(chart.lines):
+        colour = _COLOURS[index % len(_COLOURS)]
+        axes.plot(
+            line.x, line.y, color=colour, label=line.label, linewidth=1.5, marker="o" if line.marked else None, markersize=4
+        )
+    if chart.level is not None:
+        axes.axhline(chart.level, color="#b03030", linewidth=1, linestyle="--")
+    _scales(axes, chart.log)
+    axes.set_xlabel(chart.x_label)
+    axes.set_ylabel(chart.y_label)
+    axes.legend(loc="best", fontsize=8.5)
+
+
+def _scales(axes: Any, log: str) -> None:
+    if "x" in log:
+        axes.set_xscale("log")
+    if "y" in log:
+        axes.set_yscale("log")
