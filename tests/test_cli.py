@@ -170,7 +170,7 @@ def test_a_command_that_passes_its_memory_ends_and_says_so(tmp_path):
     from rangecheck.export.meshes import write_mesh
     from rangecheck.studies.scenes import ball
 
-    write_mesh(ball(2, 40.0), tmp_path / "ball.ply")
+    write_mesh(ball(6, 40.0), tmp_path / "ball.ply")
     line = ["render", str(tmp_path / "ball.ply"), "--unit", "mm", "--size", "64x64", "-o", str(tmp_path / "ball.png")]
     line += ["--set", "memory_mb=256", "-q"]
     done = subprocess.run([sys.executable, "-m", "rangecheck_cli", *line], capture_output=True, text=True)
