@@ -76,7 +76,7 @@ def cli() -> None:
     """Range scans of a head or sculpture in; a checked, physically rendered bust and its STL out.
 
     \b
-    rangecheck run sample_data --out out      the whole job
+    rangecheck run sample_data --out out           the whole job
     rangecheck check scan.ply --unit m             is it fit, and if not, where
     rangecheck COMMAND --help                      everything about one command
     """
