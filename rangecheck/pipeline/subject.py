@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 from rangecheck.arrays import FloatArray
 from rangecheck.config import Settings
-from rangecheck.errors import InputError
-from rangecheck.files import read_bytes, sha256
+from rangecheck.errors import InputError, ScanError
+from rangecheck.files import sha256
 from rangecheck.modeler.model import Model
 from rangecheck.optics import PinholeCamera
 from rangecheck.pipeline.preparing import Measured, prepared
@@ -44,10 +44,15 @@ def holds_capture(path: Path) -> bool:
 
 
 def holds_scans(path: Path) -> bool:
-    """Whether `path` is read as range scans rather than as a mesh: by its kind, and for PLY by its header."""
+    """Whether `path` is read as range scans rather than as a mesh: by its kind, and for PLY by what its header announces."""
     if path.is_dir() or path.suffix.lower() not in MESH_SUFFIXES:
         return True
-    return path.suffix.lower() == ".ply" and b"range_grid" in read_bytes(path, 4096)
+    if path.suffix.lower() != ".ply":
+        return False
+    from rangecheck.scan.readers.ply import announced
+
+    elements = announced(path)
+    return "range_grid" in elements or "camera" in elements or (bool(elements) and not {"face", "tristrips"} & set(elements))
 
 
 def decoded(folder: str | Path, reporter: Reporter) -> DecodedScan:
@@ -77,17 +82,26 @@ def read_all_scans(paths: Sequence[str | Path], unit: str | None, reporter: Repo
     scans: list[Measured] = []
     for path in map(Path, paths):
         if holds_capture(path):
-            scans.append(decoded(path, reporter).scan)
+            scans += _enough(path, [decoded(path, reporter).scan])
             continue
         with reporter.stage("reading scans"):
-            scans += read_measured(path, unit)
-    points = 0
-    for scan in scans:
-        points += len(scan.points_mm) if isinstance(scan, PointCloud) else int(scan.need_points().valid.sum())
+            scans += _enough(path, read_measured(path, unit))
+    points = sum(len(scan.points_mm) if isinstance(scan, PointCloud) else int(scan.valid.sum()) for scan in scans)
     reporter.note(f"{len(scans)} scan{'s' if len(scans) != 1 else ''}, {points:,} distances")
     # a file may call its scan anything; results are written under these names
     taken: set[str] = set()
     return [scan if name == scan.name else replace(scan, name=name) for scan in scans for name in [plain_name(scan.name, taken)]]
+
+
+def _enough(path: Path, scans: Sequence[Measured]) -> Sequence[Measured]:
+    """The scans of `path`, each of which holds enough points to go on. Raises InputError."""
+    for scan in scans:
+        if isinstance(scan, RangeScan):
+            try:
+                scan.need_points()
+            except ScanError as error:
+                raise InputError(path, str(error)) from None
+    return scans
 
 
 def surface_of(scans: Sequence[Measured], settings: Settings, reporter: Reporter) -> tuple[Surface, str, str]:

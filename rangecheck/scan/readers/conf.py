@@ -40,7 +40,7 @@ def read_conf(path: Path, unit: str | None = None) -> list[RangeScan]:
 def _placed(path: Path, scale: float) -> list[tuple[Path, FloatArray]]:
     """Files and world_from_file."""
     try:
-        lines = read_bytes(path, 1 << 20).decode("utf-8").splitlines()
+        lines = read_bytes(path, 1 << 20).decode("utf-8-sig").splitlines()
     except UnicodeDecodeError:
         raise InputError(path, "is not a text file; a .conf lists `bmesh file tx ty tz qx qy qz qw`") from None
     placed = []

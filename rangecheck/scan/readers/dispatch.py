@@ -29,6 +29,8 @@ from rangecheck.scan.readers import (
 )
 
 Measured = RangeScan | PointCloud
+#: endings of files that hold others, packed
+_PACKED = (".gz", ".bz2", ".xz", ".zst", ".z", ".zip", ".7z", ".tar", ".tgz", ".rar")
 
 
 @dataclass(frozen=True)
@@ -109,9 +111,13 @@ def read_measured(path: str | Path, unit: str | None = None) -> list[Measured]:
 
 
 def _format_of(path: Path) -> Format:
-    head = read_bytes(path, 64)
     ending = path.suffix.lower()
     fitting = [f for f in FORMATS if ending in f.endings]
+    if fitting and (path.is_fifo() or path.is_socket()):
+        raise InputError(path, "is a pipe, not a file; write what comes through it to a file")
+    head = read_bytes(path, 64) if fitting or path.is_file() or not path.exists() else b""
+    if ending in _PACKED:
+        raise InputError(path, f"is packed ({ending}); unpack it and name what was in it")
     if not fitting:
         known = ", ".join(sorted({e for f in FORMATS for e in f.endings}))
         raise InputError(path, f"ends in {ending or 'nothing'}; scans are read from {known}")
@@ -126,7 +132,11 @@ def _format_of(path: Path) -> Format:
 
 
 def _read_folder(folder: Path, unit: str | None) -> list[Measured]:
-    files = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
+    try:
+        found = sorted(p for p in folder.iterdir() if not p.name.startswith("."))
+    except OSError as error:
+        raise InputError(folder, f"cannot be read ({error.strerror}); ask for the right to, or copy it") from None
+    files = [p for p in found if p.is_file()]
     described = {p: manifest.pictures_of(p) for p in files if p.suffix.lower() == ".json"}
     leading = [p for p, pictures in described.items() if pictures is None] or [p for p in files if p.suffix.lower() == ".conf"]
     if len(leading) > 1:
@@ -136,9 +146,17 @@ def _read_folder(folder: Path, unit: str | None) -> list[Measured]:
         return read_measured(leading[0], unit)
     covered = {name for pictures in described.values() for name in pictures or ()}
     endings = {ending for f in FORMATS if f.in_folders for ending in f.endings}
+    # what cannot be read is not passed over: the other scans would then be taken for all
+    for p in found:
+        if p.suffix.lower() in _PACKED and Path(p.stem).suffix.lower() in endings:
+            raise InputError(p, f"is packed ({p.suffix}); unpack it, or move it out of the folder")
+        if p.suffix.lower() in endings and p.is_symlink() and not p.exists():
+            raise InputError(p, "is a link to nothing; mend it, or move it out of the folder")
     wanted = [
         p for p in files if p.suffix.lower() in endings and p.name not in covered and (p not in described or bool(described[p]))
     ]
     if not wanted:
-        raise InputError(folder, f"holds no scans among its {len(files)} files; scans end in {', '.join(sorted(endings))}")
+        below = [p.name for p in found if p.is_dir()]
+        hint = f"; name the folders in it one by one ({', '.join(below[:4])})" if below else ""
+        raise InputError(folder, f"holds no scans among its {len(files)} files; scans end in {', '.join(sorted(endings))}{hint}")
     return [scan for p in wanted for scan in read_measured(p, unit)]

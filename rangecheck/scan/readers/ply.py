@@ -78,6 +78,16 @@ class Ply:
         return self.elements[element]
 
 
+def announced(path: Path) -> dict[str, int]:
+    """Rows of each element as the header announces them, in its order; none where there is no whole header. What lies behind is not looked at."""
+    head = read_bytes(path, 1 << 20)
+    end = head.find(b"end_header")
+    if not head.startswith(MAGIC) or end < 0:
+        return {}
+    lines = [line.split() for line in head[:end].decode("latin-1").splitlines()]
+    return {words[1]: int(words[2]) for words in lines if len(words) == 3 and words[0] == "element" and words[2].isdecimal()}
+
+
 def read_ply(path: Path) -> Ply:
     """All elements of `path`. Raises InputError for a damaged header, counts that the file cannot hold, and truncation."""
     content = read_bytes(path)

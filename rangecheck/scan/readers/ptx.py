@@ -19,14 +19,14 @@ from rangecheck.files import read_bytes, write_bytes
 from rangecheck.scan.range_scan import RangeScan
 from rangecheck.scan.readers.limits import check_cells, check_holds
 from rangecheck.scan.readers.organised import FILE_FROM_LEVEL, level_frame, scan_from_points
-from rangecheck.scan.readers.text_numbers import parse_numbers
+from rangecheck.scan.readers.text_numbers import parse_numbers, plain_text
 
 _HEADER_NUMBERS = 2 + 3 + 9 + 16
 
 
 def read_ptx(path: Path, unit: str | None = None) -> list[RangeScan]:
     """All scans of the file that hold a point. Raises InputError when a grid is cut short or a pose is no rigid motion."""
-    content = read_bytes(path)
+    content = plain_text(read_bytes(path))
     unit = unit or "m"
     scans, position, number = [], 0, 0
     while content[position:].strip() or number == 0:

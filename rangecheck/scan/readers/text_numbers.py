@@ -136,6 +136,12 @@ def parse_numbers(
     return out[:found], end
 
 
+def plain_text(content: bytes) -> bytes:
+    """Text without the mark that some programs put before UTF-8, and with line feeds where its lines end by carriage returns alone."""
+    content = content.removeprefix(b"\xef\xbb\xbf")
+    return content.replace(b"\r", b"\n") if b"\r" in content and b"\n" not in content else content
+
+
 def _careful(path: Path, text: bytes, first: int, last: int, decimal: str) -> float:
     token = text[first : min(last, first + 400)]
     try:

@@ -15,14 +15,14 @@ from rangecheck.errors import InputError, UnitMissing
 from rangecheck.files import read_bytes
 from rangecheck.scan.point_cloud import PointCloud
 from rangecheck.scan.readers.ply import Ply
-from rangecheck.scan.readers.text_numbers import parse_numbers, punctuation
+from rangecheck.scan.readers.text_numbers import parse_numbers, plain_text, punctuation
 
 
 def read_xyz(path: Path, unit: str | None = None) -> list[PointCloud]:
     """The one cloud of a text file. Raises InputError that names the line, UnitMissing without a unit."""
     if unit is None:
         raise UnitMissing(path)
-    content = read_bytes(path)
+    content = plain_text(read_bytes(path))
     if b"\0" in content[:4096]:
         raise InputError(path, "is not a text file; a list of points holds lines `x y z`")
     start = _after_head(path, content)

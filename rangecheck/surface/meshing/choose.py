@@ -19,7 +19,7 @@ from rangecheck.surface.surface import Surface
 def _grid(
     scans: Sequence[RangeScan | PointCloud], *, max_angle_deg: float | None = None, noise_mm: float | None = None
 ) -> Surface:
-    if len(scans) != 1 or isinstance(scans[0], PointCloud):
+    if len(scans) != 1:
         raise ScanError(f"grid meshes one range scan, and there are {len(scans)} scans; use fuse, or choose one scan")
     angle = {} if max_angle_deg is None else {"max_angle_deg": max_angle_deg}
     return grid_mesh(scans[0], noise_mm=noise_mm, **angle)
@@ -61,6 +61,13 @@ def mesh_scans(scans: Sequence[RangeScan | PointCloud], method: str = "auto", **
     if method == "auto":
         method, _ = choose_method(scans)
     aside = (_NOT_GRID if method == "grid" else _ONLY_GRID) + (() if method == "fuse" else _ONLY_FUSE)
+    clouds = [scan for scan in scans if isinstance(scan, PointCloud)]
+    if clouds and method in ("grid", "fuse"):
+        raise ScanError(
+            f"{clouds[0].name} is {len(clouds[0].points_mm)} points without a grid or a place they were seen from, and {method} needs "
+            "both; use poisson or pivot",
+            name=clouds[0].name,
+        )
     given = {name: value for name, value in settings.items() if value is not None and name not in aside}
     try:
         return _BY_NAME[method](scans, **given)
