@@ -21,6 +21,7 @@ def _grid(
 ) -> Surface:
     if len(scans) != 1:
         raise ScanError(f"grid meshes one range scan, and there are {len(scans)} scans; use fuse, or choose one scan")
+    assert isinstance(scans[0], RangeScan)  # clouds were refused at the door
     angle = {} if max_angle_deg is None else {"max_angle_deg": max_angle_deg}
     return grid_mesh(scans[0], noise_mm=noise_mm, **angle)
 
