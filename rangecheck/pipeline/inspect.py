@@ -12,7 +12,7 @@ from rangecheck.config import Settings
 from rangecheck.errors import InputError, PosesRefused
 from rangecheck.files import sha256
 from rangecheck.pipeline.outcome import Outcome, document
-from rangecheck.pipeline.preparing import prepared, scan_facts
+from rangecheck.pipeline.preparing import counted, prepared, scan_facts
 from rangecheck.pipeline.subject import holds_scans, read_all_scans
 from rangecheck.progress import Reporter
 from rangecheck.solid.findings import catalogue
@@ -68,7 +68,7 @@ def _check_scans(file: str, settings: Settings, unit: str | None, reporter: Repo
     """What the scans of one path hold, whether their pictures contradict them, whether they belong together, and what they are worth."""
     scans = read_all_scans([file], unit, reporter)
     about = [scan_facts(scan) for scan in scans]
-    lines = [f"{file}: {_counted(scans)}"]
+    lines = [f"{file}: {counted(scans)}"]
     for a in about:
         if a["camera"] is None:
             lines.append(f"  {a['name']}: {a['valid']:,} points without a grid; what they are worth cannot be told")
@@ -92,13 +92,6 @@ def _check_scans(file: str, settings: Settings, unit: str | None, reporter: Repo
     fit = (ready.quality is None or ready.quality["verdict"] != "unfit") and all(f.severity != "error" for f in seen.findings)
     facts |= {"fit": fit, "registration": ready.registration, "filtered": ready.filtered, "quality": ready.quality}
     return facts, [*lines, *(f"  {line}" for line in ready.quality_lines)]
-
-
-def _counted(scans: Sequence[Measured]) -> str:
-    """How many scans and clouds were read, in words."""
-    clouds = sum(isinstance(scan, PointCloud) for scan in scans)
-    counts = ((len(scans) - clouds, "range scan"), (clouds, "point cloud"))
-    return ", ".join(f"{n} readable {what}{'s' if n > 1 else ''}" for n, what in counts if n)
 
 
 def _word_of(opinion: Opinion) -> str:

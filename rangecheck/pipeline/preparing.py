@@ -213,6 +213,13 @@ def _by_view(found: Any) -> list[str]:
     ]
 
 
+def counted(scans: Sequence[Measured]) -> str:
+    """How many scans and clouds were read, in words."""
+    clouds = sum(isinstance(scan, PointCloud) for scan in scans)
+    counts = ((len(scans) - clouds, "range scan"), (clouds, "point cloud"))
+    return ", ".join(f"{n} readable {what}{'s' if n > 1 else ''}" for n, what in counts if n)
+
+
 def scan_facts(scan: Measured) -> dict[str, Any]:
     """What a scan holds, in numbers; `camera` is None for a cloud."""
     if isinstance(scan, PointCloud):
