@@ -29,7 +29,7 @@ _WHERE = {
     "run_each": "many",
     "sample": "scanning",
     "schema": "beginning",
-    "simulate": "scanning",
+    "simulate": "simulating",
     "solid": "shape",
     "study": "inspect",
     "turntable": "turning",

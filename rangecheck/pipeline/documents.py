@@ -145,6 +145,10 @@ def _documents() -> dict[str, tuple[Any, ...]]:
     placed = {"registration": or_null(ref("registration")), "filtered": TEXTS, "refined": many(ref("refined"))}
     refused = record(fit={"const": False}, output={"type": "null"}, registration=ref("registration"), seconds=NUMBERS)
     shown = {"camera": ref("camera"), "world_from_camera": POSE}
+    simulated = {
+        "kind": TEXT, "distance_mm": NUMBER, "noise_mm": NUMBER, "seed": COUNT, "inputs": NAMES, "instrument": by_name(ANYTHING),
+        "finish": or_null(NUMBERS), "motion": or_null(by_name(ANYTHING)),
+    }  # fmt: skip
     optics = {"vignetting": FLAG, "lens": maybe(NUMBERS), "sensor": maybe(by_name(ANYTHING))}
     explanation = fields_of(Explanation)
     regions = many(fields_of(Region, middle_mm=POINT))
@@ -247,7 +251,8 @@ def _documents() -> dict[str, tuple[Any, ...]]:
         ),
         "simulate": (
             "`simulate`",
-            record(manifest=TEXT, valid=many(COUNT), distance_mm=NUMBER, noise_mm=NUMBER, seed=COUNT, inputs=NAMES),
+            record(manifest=TEXT, valid=many(COUNT), reasons=by_name(COUNT), **simulated),
+            record(captures=TEXTS, **simulated),
         ),
         "sample": ("`sample`", record(manifests=TEXTS, files=NAMES)),
         "decode": (

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rangecheck import rigid
-from rangecheck.arrays import FloatArray, IntArray, require
+from rangecheck.arrays import BoolArray, FloatArray, IntArray, require
 from rangecheck.errors import SettingError
 from rangecheck.optics import Camera
 from rangecheck.scan.range_scan import RangeScan
@@ -143,7 +143,7 @@ def simulate_scan(
         pose,
         brightness=brightness,
         name=name,
-        noise_mm=finder.noise_mm if finder.noise_mm > 0 else None,
+        noise_mm=_stated(finder, noise, view.cos_camera, seen),
     )
     return SimulatedScan(
         scan,
@@ -154,6 +154,15 @@ def simulate_scan(
         signal.reshape(shape),
         time.reshape(shape),
     )
+
+
+def _stated(finder: RangeFinder, noise: FloatArray, cosine: FloatArray, seen: BoolArray) -> float | None:
+    """Noise that the instrument states: the one it was given, where its model takes one, else what it comes to at normal incidence."""
+    if finder.kind == "time-of-flight" or (finder.kind == "stripe" and finder.noise_model in ("quadratic", "photon")):
+        return finder.noise_mm if finder.noise_mm > 0 else None
+    with np.errstate(invalid="ignore"):
+        head_on = (noise * cosine)[seen & np.isfinite(noise * cosine)]
+    return float(np.median(head_on)) if len(head_on) and np.median(head_on) > 0 else None
 
 
 def ring_of_poses(

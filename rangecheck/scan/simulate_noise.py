@@ -11,6 +11,13 @@ import numpy as np
 
 from rangecheck.arrays import FloatArray
 
+#: whose law each noise model is
+SOURCES = {
+    "quadratic": "Besl 1988",
+    "speckle": "Dorsch, Hausler, Herrmann 1994",
+    "kinect": "Nguyen, Izadi, Lovell 2012",
+    "photon": "Lange, Seitz 2001",
+}
 SPEED_OF_LIGHT_MM_S = 299_792_458_000.0
 
 

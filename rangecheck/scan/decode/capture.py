@@ -56,6 +56,9 @@ def read_capture(folder: str | Path) -> Capture:
         return Capture(left, left_view, right, right_view, None)
     if not folder.is_dir():
         raise InputError(folder, "is not a folder of structured-light pictures")
+    below = sorted(p.parent.name for p in folder.glob("*/capture.json"))
+    if below:
+        raise InputError(folder, f"holds {len(below)} captures in its folders; name them one by one ({', '.join(below[:4])})")
     raise InputError(folder, "holds neither capture.json nor leftCam and rightCam; describe the pictures in capture.json")
 
 
