@@ -14,6 +14,7 @@ from rangecheck.surface import INTERPOLATED, INVENTED, MEASURED, Surface
 from rangecheck.surface.meshing import fuse
 from rangecheck.surface.meshing.fit_error import noise_of_blend
 from rangecheck.surface.meshing.local_fit import quiet_ranges
+from rangecheck.surface.meshing.samples import distance_to_samples, sample_grid
 from rangecheck.surface.meshing.views import SMOOTHED, views_of
 from rangecheck.surface.topology import (
     boundary_edges,
@@ -143,33 +144,52 @@ def test_the_expected_error_covers_the_true_one():
     assert np.median(surface.vertex_error_mm) < 0.1 / np.sqrt(5)
 
 
-def _fitted(truth: np.ndarray, sigma: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Errors of the local fits of noisy ranges `truth` seen by parallel rays 1 mm apart, and (h, w, 10) the fits; their borders cut off."""
+def _fitted(truth: np.ndarray, sigma: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Of the local fits of noisy ranges `truth` seen by parallel rays 1 mm apart, their borders cut off: errors, standard errors of the fits
+    alone and of what is read between cells, and mean squares of what they smooth away."""
     noisy = truth + np.random.default_rng(seed).normal(0.0, sigma, truth.shape)
-    fits, _ = quiet_ranges(noisy, np.array([0.0, 1.0]), sigma)
+    fits = quiet_ranges(noisy, np.array([0.0, 1.0]), sigma)
+    alone = fits.values[..., 3]
     inside = (slice(8, -8), slice(8, -8))
-    return (fits[..., 0] - truth)[inside], fits[inside]
+    found = (fits.values[..., 0] - truth, alone, alone * fits.factors[fits.chosen], fits.clues[..., 0])
+    return tuple(values[inside] for values in found)
 
 
 def test_on_a_plane_the_local_fits_err_by_what_they_say_and_smooth_nothing_away():
     v, u = np.mgrid[0:160, 0:160].astype(float)
-    error, fits = _fitted(500.0 + 0.2 * u - 0.1 * v, 0.1, seed=3)
-    stated = fits[..., 4] / noise_of_blend()[-1]
+    error, _, between, lost = _fitted(500.0 + 0.2 * u - 0.1 * v, 0.1, seed=3)
+    stated = between / noise_of_blend()[-1]
     # an RMS over cells of which some 25 share their samples
     few = np.sqrt(25 / error.size)
     assert abs(np.sqrt(np.mean(error**2) / np.mean(stated**2)) - 1.0) < 4 * few
-    assert abs(np.mean(fits[..., 5])) < 0.2 * np.mean(stated**2)
+    assert abs(np.mean(lost)) < 0.2 * np.mean(stated**2)
 
 
 @pytest.mark.parametrize("period", [10.0, 14.0])
 def test_ripples_that_the_local_fits_smooth_away_are_told_from_the_scan(period):
     v, u = np.mgrid[0:160, 0:160].astype(float)
     truth = 500.0 + 0.05 * np.sin(2 * np.pi * u / period) * np.sin(2 * np.pi * v / period)
-    error, fits = _fitted(truth, 0.02, seed=4)
-    total = np.mean(fits[..., 4] ** 2 + fits[..., 5])
-    assert np.mean(error**2) > 1.5 * np.mean(fits[..., 3] ** 2)  # noise alone does not explain it
+    error, alone, between, lost = _fitted(truth, 0.02, seed=4)
+    total = np.mean(between**2 + lost)
+    assert np.mean(error**2) > 1.5 * np.mean(alone**2)  # noise alone does not explain it
     # the fourth-power law is the first term of a series in (width / period)^2
     assert 0.7 < np.sqrt(np.mean(error**2) / total) < 1.4
+
+
+@pytest.mark.parametrize("enough", [0.0, 3.0])
+def test_the_nearest_sample_is_found_however_far_it_lies(enough):
+    from scipy.spatial import cKDTree
+
+    rng = np.random.default_rng(2)
+    # a sheet, and a few samples far beside it: most cells of the box are empty
+    samples = np.concatenate([rng.uniform(0, 40, (4000, 3)) * (1, 1, 0.02), rng.uniform(90, 130, (5, 3))])
+    asked = rng.uniform(-60, 160, (3000, 3))
+    true = cKDTree(samples).query(asked)[0]
+    found = distance_to_samples(sample_grid(samples, 1.5), asked, 70.0, enough)
+    assert (np.isinf(found) == (true > 70.0)).all()
+    exact = np.isfinite(found) & (true > enough)
+    np.testing.assert_allclose(found[exact], true[exact], rtol=1e-12)
+    assert (found[true <= enough] <= max(enough, 1e-12)).all()
 
 
 @pytest.mark.parametrize("grain_mm", [0.0, 0.06, 0.2])

@@ -21,8 +21,6 @@ from rangecheck.surface.meshing.views import Views
 UNKNOWN, FREE, SEEN = 0, 1, 2
 BLOCK = 8
 CORNERS = BLOCK**3
-#: four cells whose surfaces differ by more than this many pitches (or six standard errors) lie across a depth jump
-JUMP_PITCHES = 2.0
 
 
 @inline_kernel

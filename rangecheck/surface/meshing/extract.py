@@ -146,10 +146,9 @@ def zero_set(grid: Grid, coarse: FloatArray) -> tuple[FloatArray, FloatArray, Fl
     n = int(start[-1])
     number = np.zeros((blocks, CORNERS), np.int32)
     points, normals, low, seen = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3)), np.zeros(n, bool)
-    state = grid.state.astype(np.float32)
     in_chunks(
         lambda i, j: _vertices(
-            grid.near, grid.place, grid.field, state, coarse, case, start, count, sheet_of_edge, edges,
+            grid.near, grid.place, grid.field, grid.state, coarse, case, start, count, sheet_of_edge, edges,
             grid.origin_mm, grid.step_mm, i, j, number, points, normals, low, seen,
         ),
         blocks, 256,

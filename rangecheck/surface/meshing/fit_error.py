@@ -15,14 +15,16 @@ from functools import lru_cache
 import numpy as np
 
 from rangecheck.arrays import FloatArray, IntArray
+from rangecheck.kernels import in_chunks, kernel
 
 #: standard deviations of the Gaussian windows in pixels, narrow to wide; each window reaches two of them
 WIDTHS_PX = (0.9, 1.3, 1.9, 2.7)
 #: half widths, in cells, of the neighbourhoods over which the steps between widths are pooled: the small one where the step is so clear
 #: that noise makes its square by this factor less, which a handful of cells tells
 POOL_CELLS, NEAR_CELLS, CLEAR = 6, 2, 2.0
-#: added to the number of a window where the next one was whole and disagreed
-STOPPED = 8
+#: added to the number of a window where the next one was whole and disagreed; numbers of windows and this, a power of two
+STOPPED, CODES = 8, 16
+COUNTED_ROWS = 32
 
 
 @lru_cache(maxsize=1)
@@ -90,32 +92,60 @@ def noise_of_choice(confidence: float) -> tuple[FloatArray, FloatArray]:
     return error, np.bincount(chosen, minlength=len(gain)) / len(draws)
 
 
-def noise_of_fits(plain: FloatArray, sigma: FloatArray, chosen: IntArray, confidence: float) -> FloatArray:
-    """(h, w) mm: `plain` (noise gain times noise) of the blend of four neighbours, and more where noise stopped the windows.
+@kernel
+def _count(chosen, first, last, count):
+    for row in range(first, last):
+        for col in range(chosen.shape[1]):
+            count[chosen[row, col] & CODES - 1] += 1
+
+
+def noise_factors(chosen: IntArray, confidence: float) -> FloatArray:
+    """(CODES,) float32, by what a cell chose: the noise of the blend of four neighbours over that of its own fit, and more where noise stopped
+    the windows. chosen (h, w): number of the window plus STOPPED where the next one disagreed; -1, of which the last entry tells, at edges.
 
     A width that a scan's cells stop at more often than noise alone would make them was chosen, beyond that share, for the surface."""
     error, often = noise_of_choice(confidence)
-    gain = quadratic_windows()[2]
-    known = chosen >= 0
-    result = plain * noise_of_blend().astype(np.float32)[np.where(known, chosen % STOPPED, 0)]
-    for scale in range(len(gain) - 1):
-        stopped = known & (chosen == scale + STOPPED)
-        able = int((known & ((chosen % STOPPED) >= scale) & ((chosen % STOPPED) + (chosen >= STOPPED) > scale)).sum())
-        share = min(1.0, often[scale] * able / max(int(stopped.sum()), 1))
-        more = math.sqrt(share * (error[scale] / gain[scale]) ** 2 + 1.0 - share)
-        result[stopped] *= np.float32(more)
-    return result
+    gain, blend = quadratic_windows()[2], noise_of_blend()
+    counts = np.zeros((-(-len(chosen) // COUNTED_ROWS), CODES), np.int64)
+    in_chunks(lambda i, j: _count(chosen, i, j, counts[i // COUNTED_ROWS]), len(chosen), COUNTED_ROWS)
+    whole, stopped = counts.sum(axis=0)[: len(gain)], counts.sum(axis=0)[STOPPED : STOPPED + len(gain)]
+    factors = np.full(CODES, blend[0])
+    for scale in range(len(gain)):
+        factors[scale] = factors[scale + STOPPED] = blend[scale]
+        if scale < len(gain) - 1:
+            able = int(whole[scale + 1 :].sum() + stopped[scale:].sum())
+            share = min(1.0, often[scale] * able / max(int(stopped[scale]), 1))
+            factors[scale + STOPPED] *= math.sqrt(share * (error[scale] / gain[scale]) ** 2 + 1.0 - share)
+    return factors.astype(np.float32)
+
+
+@kernel
+def _pool(steps, cells, first, last, pooled):
+    """The mean of `steps` (h, w, n), which stand for every second cell, over `cells` to each side, of those known; 0 where none is."""
+    height, width, scales = steps.shape
+    r = cells // 2
+    total, known = np.empty((width, scales), np.float32), np.empty((width, scales), np.float32)
+    for row in range(first, last):
+        total[:] = 0.0
+        known[:] = 0.0
+        for v in range(max(row - r, 0), min(row + r, height - 1) + 1):
+            for col in range(width):
+                for k in range(scales):
+                    if steps[v, col, k] == steps[v, col, k]:
+                        total[col, k] += steps[v, col, k]
+                        known[col, k] += 1.0
+        for col in range(width):
+            for k in range(scales):
+                s = n = np.float32(0.0)
+                for u in range(max(col - r, 0), min(col + r, width - 1) + 1):
+                    s += total[u, k]
+                    n += known[u, k]
+                pooled[row, col, k] = s / n if n > 0.0 else np.float32(0.0)
 
 
 def _pooled(steps: FloatArray, cells: int) -> FloatArray:
-    """The mean of `steps` (h, w, n), which stand for every second cell, over `cells` to each side, of those known; 0 where none is."""
-    from scipy.ndimage import uniform_filter
-
-    side = 2 * (cells // 2) + 1
-    known = np.isfinite(steps)
-    total = uniform_filter(np.where(known, steps, np.float32(0)), (side, side, 0), mode="constant")
-    count = uniform_filter(known.astype(np.float32), (side, side, 0), mode="constant")
-    pooled: FloatArray = total / np.maximum(count, 0.5 / side**2)
+    pooled = np.empty_like(steps)
+    in_chunks(lambda i, j: _pool(steps, cells, i, j, pooled), len(steps), COUNTED_ROWS)
     return pooled
 
 
@@ -136,22 +166,26 @@ def noise_of_steps() -> FloatArray:
     return steps
 
 
-def smoothed_away(steps: FloatArray, noise: FloatArray, chosen: IntArray, clues: FloatArray) -> None:
+@kernel
+def _clues(near, around, apart, sigma, chosen, share, left_out, first, last, clues):
+    for row in range(first, last):
+        for col in range(chosen.shape[1]):
+            v, u = row // 2, col // 2
+            scale = 0 if chosen[row, col] < 0 else chosen[row, col] % STOPPED
+            step = max(scale, 1)
+            clear = near[v, u, step] > CLEAR * apart[step] * sigma[2 * v, 2 * u] ** 2
+            clues[row, col, 0] = (near[v, u, step] if clear else around[v, u, step]) * share[scale]
+            clues[row, col, 1], clues[row, col, 2] = near[v, u, 0] * left_out, around[v, u, 0] * left_out
+
+
+def smoothed_away(steps: FloatArray, sigma: FloatArray, chosen: IntArray, clues: FloatArray) -> None:
     """Fill `clues` (h, w, 3), mm^2, below 0 where noise says less than nothing: what the chosen width smooths away by the fourth-power
     law, and by how much the samples near the cell and around it scatter about the narrowest fit without them, beyond noise.
 
-    steps (h / 2, w / 2, scales) squares of the steps between widths less their noise's; noise the same shape, what was taken off."""
+    steps (h / 2, w / 2, scales) squares of the steps between widths less their noise's; sigma (h, w) noise of one range."""
     near, around = _pooled(steps, NEAR_CELLS), _pooled(steps, POOL_CELLS)
-    squares = np.where(near > CLEAR * noise, near, around)
     fourth = np.array(WIDTHS_PX) ** 4
     share = np.array([fourth[0] / (fourth[1] - fourth[0]), *(fourth[1:] / (fourth[1:] - fourth[:-1]))]) ** 2
-    step = np.maximum(np.arange(len(fourth)), 1)
-    scale = np.where(chosen < 0, 0, chosen % STOPPED)
     left_out = 1.0 / (1.0 - middle_weights()[0]) ** 2
-
-    def full(values: FloatArray) -> FloatArray:
-        whole: FloatArray = values.repeat(2, axis=0)[: chosen.shape[0]].repeat(2, axis=1)[:, : chosen.shape[1]]
-        return whole
-
-    clues[..., 0] = np.take_along_axis(full(squares), step[scale][..., None], axis=2)[..., 0] * share[scale]
-    clues[..., 1], clues[..., 2] = full(near[..., 0]) * left_out, full(around[..., 0]) * left_out
+    apart = noise_of_steps()
+    in_chunks(lambda i, j: _clues(near, around, apart, sigma, chosen, share, left_out, i, j, clues), len(chosen), COUNTED_ROWS)

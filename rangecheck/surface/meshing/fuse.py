@@ -13,7 +13,7 @@ import numpy as np
 
 from rangecheck.arrays import BoolArray, FloatArray, IntArray
 from rangecheck.errors import SettingError, SurfaceError
-from rangecheck.kernels import kernel
+from rangecheck.kernels import in_chunks, kernel
 from rangecheck.scan import RangeScan
 from rangecheck.surface.meshing.blocks import Grid, add_blocks, box_for, grid_near, missing_blocks, part_touching
 from rangecheck.surface.meshing.closing import coarse_field, fill_open, smooth_open
@@ -22,7 +22,7 @@ from rangecheck.surface.meshing.extract import MARGIN, split_quads, zero_set
 from rangecheck.surface.meshing.labels import UNSEEN_ERROR, thresholds
 from rangecheck.surface.meshing.openings import opened
 from rangecheck.surface.meshing.samples import distance_to_samples, label_faces, sample_grid
-from rangecheck.surface.meshing.shells import shell_of_vertex, shells_to_keep
+from rangecheck.surface.meshing.shells import areas, shell_of_vertex, shells_to_keep
 from rangecheck.surface.meshing.tiles import Tiles, tiles_of
 from rangecheck.surface.meshing.views import Views, views_of
 from rangecheck.surface.surface import MEASURED, Surface
@@ -67,18 +67,23 @@ def fuse(
     measured, interpolated = thresholds(views.spacing_mm, measured_mm, interpolated_mm)
     grid, coarse = _grid_of_distances(views, step)
     points, normals, low, seen, quads = zero_set(grid, coarse)
+    del grid, coarse
     if len(quads) == 0:
         raise SurfaceError("the scans' distances have no zero set; check their poses and unit, or choose a smaller voxel_mm")
     error = _settle(views, points, normals, low, seen, quads, step)
+    samples, shift = views.samples_mm, views.shift_mm
+    del views, normals, low, seen
     faces = split_quads(points, quads)
-    nearby = sample_grid(views.samples_mm, measured)
+    del quads
+    nearby = sample_grid(samples, measured)
     origin = label_faces(nearby, points, faces, measured, interpolated)
     points, faces, origin, error = _without_floating_bits(points, faces, origin, error, least_shell)
     unseen = ~np.isfinite(error)
     reach = float(np.linalg.norm(np.ptp(points, axis=0)))
-    wide = sample_grid(views.samples_mm, interpolated)
-    error[unseen] = UNSEEN_ERROR * distance_to_samples(wide, points[unseen], reach)
-    surface = Surface(points + views.shift_mm, faces, origin_of_face=origin, vertex_error_mm=error)
+    error[unseen] = UNSEEN_ERROR * distance_to_samples(nearby, points[unseen], reach)
+    del nearby, samples
+    points += shift
+    surface = Surface(points, faces, origin_of_face=origin, vertex_error_mm=error)
     return opened(surface, closing, largest_hole_mm)
 
 
@@ -134,25 +139,33 @@ def _settle(
     points[chosen], normals[chosen] = moved, directions
     others[chosen] = np.maximum(looks - 1, 0)
     scatter[chosen] = beyond * others[chosen]
-    for _ in range(SCATTER_RINGS):
-        scatter, others = _with_neighbours(quads, scatter), _with_neighbours(quads, others)
-    pooled = np.maximum(scatter[chosen], 0.0) / np.maximum(others[chosen], 1e-12)
+    both = np.stack([scatter, others], axis=1)
+    _pool_over_neighbours(quads, both, SCATTER_RINGS)
+    pooled = np.maximum(both[chosen, 0], 0.0) / np.maximum(both[chosen, 1], 1e-12)
     error[chosen] = np.sqrt(variance + np.where(looks > 1, pooled, 0.0))
     return error
 
 
 @kernel
-def _with_neighbours(quads, values):
-    """Each vertex's value plus those at the other ends of its edges, every edge as often as it has faces, over one plus their number."""
-    total, count = values.copy(), np.ones(len(values))
+def _pool_over_neighbours(quads, values, rings):
+    """`rings` times: each vertex's values (n, 2) plus those at the other ends of its edges, every edge as often as it has faces, over one
+    plus their number."""
+    count = np.ones(len(values), np.int32)
     for q in range(len(quads)):
         for corner in range(4):
-            a, b = quads[q, corner], quads[q, (corner + 1) % 4]
-            total[a] += values[b]
-            total[b] += values[a]
-            count[a] += 1.0
-            count[b] += 1.0
-    return total / count
+            count[quads[q, corner]] += 2
+    before = np.empty_like(values)
+    for _ in range(rings):
+        before[:] = values
+        for q in range(len(quads)):
+            for corner in range(4):
+                a, b = quads[q, corner], quads[q, (corner + 1) % 4]
+                for k in range(2):
+                    values[a, k] += before[b, k]
+                    values[b, k] += before[a, k]
+        for v in range(len(values)):
+            for k in range(2):
+                values[v, k] /= count[v]
 
 
 def _without_floating_bits(
@@ -161,11 +174,22 @@ def _without_floating_bits(
     shell = shell_of_vertex(faces, len(points))
     if len(shell) == 0 or shell.max() == 0:
         return points, faces, origin, error
-    a, b, c = (points[faces[:, corner]] for corner in range(3))
-    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    area = np.empty(len(faces))
+    in_chunks(lambda i, j: areas(points, faces, i, j, area), len(faces), 65536)
     wanted = np.zeros(int(shell.max()) + 1, bool)
     wanted[shells_to_keep(shell[faces[:, 0]], area, origin == MEASURED, least_share)] = True
     keep = wanted[shell]
-    number = np.cumsum(keep) - 1
-    kept = keep[faces[:, 0]]
-    return points[keep], number[faces[kept]].astype(np.int32), origin[kept], error[keep]
+    if keep.all():
+        return points, faces, origin, error
+    number = np.cumsum(keep, dtype=np.int32) - np.int32(1)
+    kept = np.flatnonzero(keep[faces[:, 0]])
+    fewer = np.empty((len(kept), 3), np.int32)
+    in_chunks(lambda i, j: _renumbered(faces, kept, number, i, j, fewer), len(kept), 65536)
+    return points[keep], fewer, origin[kept], error[keep]
+
+
+@kernel
+def _renumbered(faces, kept, number, first, last, out):
+    for f in range(first, last):
+        for corner in range(3):
+            out[f, corner] = number[faces[kept[f], corner]]

@@ -72,8 +72,9 @@ def _products(kind, numbers, size, start, cells, residual, points, own, scan, ne
 def detail_lost(
     arrays: tuple[IntArray, FloatArray, IntArray, IntArray, FloatArray],
     residual: FloatArray, clues: FloatArray, wide: BoolArray, noise: FloatArray, points_mm: FloatArray, own: IntArray, reach_mm: float,
-) -> FloatArray:  # fmt: skip
-    """(n,) float32 mean square of the detail lost in each cell's fit; below 0 where clues say less than nothing.
+    lost: FloatArray,
+) -> None:  # fmt: skip
+    """Fill `lost` (n,) float32 with the mean square of the detail lost in each cell's fit; below 0 where clues say less than nothing.
 
     arrays     of `Views`: kind, numbers, size, start, cells
     residual   (n,) of each cell's sample beside its fit without it, NaN where unknown; noise (n,) its standard deviation
@@ -89,17 +90,24 @@ def detail_lost(
     )
     told = np.isfinite(product) & np.isfinite(clues[own]).all(axis=1)
     left_out = float(noise_of_steps()[0] / (1.0 - middle_weights()[0]) ** 2)
-    result = np.empty(len(cells), np.float32)
-    for group in (False, True):
+    weights = np.empty((2, 1 + CLUES), np.float32)
+    for group in (0, 1):
         mine = told & (wide[own] == group)
         chosen = own[mine]
         spread = left_out * noise[chosen] * noise[other[mine]]
-        weights = (
-            _regressed(product[mine], clues[chosen].astype(float), spread.astype(float)) if mine.sum() >= FEWEST else BELIEVED
-        )
-        cells_of_group = wide == group
-        result[cells_of_group] = weights[0] + clues[cells_of_group] @ weights[1:].astype(np.float32)
-    return result
+        enough = len(chosen) >= FEWEST
+        weights[group] = _regressed(product[mine], clues[chosen].astype(float), spread.astype(float)) if enough else BELIEVED
+    in_chunks(lambda i, j: _predict(clues, wide, weights, i, j, lost), len(cells), 65536)
+
+
+@kernel
+def _predict(clues, wide, weights, first, last, lost):
+    for i in range(first, last):
+        of = weights[1] if wide[i] else weights[0]
+        value = of[0]
+        for k in range(CLUES):
+            value += of[1 + k] * clues[i, k]
+        lost[i] = value
 
 
 def _regressed(product: FloatArray, clues: FloatArray, spread: FloatArray) -> FloatArray:

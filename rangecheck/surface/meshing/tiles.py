@@ -17,7 +17,7 @@ from rangecheck.surface.meshing.projection import project
 from rangecheck.surface.meshing.views import Views
 
 #: cells along a tile's side
-TILE = 8
+TILE = 4
 BEHIND, BETWEEN, BEFORE = 0, 1, 2
 
 

@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -18,10 +19,12 @@ from rangecheck import rigid
 from rangecheck.arrays import BoolArray, FloatArray, IntArray
 from rangecheck.errors import ScanError
 from rangecheck.kernels import in_chunks, kernel
-from rangecheck.optics import Camera
+from rangecheck.optics import Camera, RayGrid
 from rangecheck.scan import RangeScan
-from rangecheck.surface.meshing.local_fit import BEND_TAN, quiet_ranges
-from rangecheck.surface.meshing.projection import project, projection_of
+from rangecheck.surface.meshing.edge_fit import BEND_TAN
+from rangecheck.surface.meshing.fit_error import CODES, STOPPED, middle_weights
+from rangecheck.surface.meshing.local_fit import quiet_ranges
+from rangecheck.surface.meshing.projection import Projection, project, projection_of
 from rangecheck.surface.meshing.shared_detail import CLUES, detail_lost
 
 #: numbers per cell: range, half u slope, half v slope, weight, normal x y z, |ray . normal|, variance along the normal by noise, and
@@ -43,15 +46,13 @@ class Views:
 
     kind (s,) int64; numbers (s, 37) pose and camera; size (s, 2) int64 height, width; start (s,) int64 first cell of each scan;
     cells (n, 10) float32 records: range is NaN where nothing is known and +inf where the ray met nothing;
-    noise_mm (n,) float32 standard deviation of one range; samples_mm (k, 3) valid samples, shifted world frame;
-    spacing_mm median distance between neighbouring samples along the surface; shift_mm (3,)."""
+    samples_mm (k, 3) valid samples, shifted world frame; spacing_mm median distance between neighbouring samples along the surface; shift_mm (3,)."""
 
     kind: IntArray
     numbers: FloatArray
     size: IntArray
     start: IntArray
     cells: FloatArray
-    noise_mm: FloatArray
     samples_mm: FloatArray
     spacing_mm: float
     shift_mm: FloatArray
@@ -69,18 +70,20 @@ class Views:
 
 
 @kernel
-def _records(fit, origins, directions, rotation, edge, pitch, first, last, cells, clues, residual):
-    """Fill the records, clues and residuals of rows first..last from the local fits."""
-    height, width = fit.shape[0], fit.shape[1]
+def _records(
+    ranges, chosen, factors, left_out, origins, directions, rotation, edge, pitch, first, last, cells, clues, residual, lateral
+):  # fmt: skip
+    """Make the local fits in `cells` (h, w, FIELDS) the records of rows first..last; clues and residuals become distances along the normal."""
+    height, width = edge.shape[0], edge.shape[1]
     for row in range(first, last):
         r0, r1 = max(row - 1, 0), min(row + 1, height - 1)
         for col in range(width):
-            i = row * width + col
-            cells[i, :] = 0.0
-            cells[i, 0] = residual[i] = np.nan
-            clues[i, :] = 0.0
-            r = float(fit[row, col, 0])
+            record = cells[row, col]
+            r, su, sv, quiet = float(record[0]), float(record[1]), float(record[2]), float(record[3])
+            record[:] = 0.0
+            record[0] = residual[row, col] = lateral[row, col] = np.nan
             if not math.isfinite(r):
+                clues[row, col, :] = 0.0
                 continue
             c0, c1 = max(col - 1, 0), min(col + 1, width - 1)
             du, dv = 1.0 / (c1 - c0), 1.0 / (r1 - r0)
@@ -91,31 +94,31 @@ def _records(fit, origins, directions, rotation, edge, pitch, first, last, cells
             pv0 = (origins[r1, col, 0] - origins[r0, col, 0] + r * (directions[r1, col, 0] - directions[r0, col, 0])) * dv
             pv1 = (origins[r1, col, 1] - origins[r0, col, 1] + r * (directions[r1, col, 1] - directions[r0, col, 1])) * dv
             pv2 = (origins[r1, col, 2] - origins[r0, col, 2] + r * (directions[r1, col, 2] - directions[r0, col, 2])) * dv
-            su, sv = float(fit[row, col, 1]), float(fit[row, col, 2])
             pu0, pu1, pu2 = pu0 + su * d[0], pu1 + su * d[1], pu2 + su * d[2]
             pv0, pv1, pv2 = pv0 + sv * d[0], pv1 + sv * d[1], pv2 + sv * d[2]
             nx, ny, nz = pu1 * pv2 - pu2 * pv1, pu2 * pv0 - pu0 * pv2, pu0 * pv1 - pu1 * pv0
             length = math.sqrt(nx * nx + ny * ny + nz * nz)
-            if not length > 0.0:
-                continue
             along = (nx * d[0] + ny * d[1] + nz * d[2]) / length
+            cosine = abs(along)
+            if not (length > 0.0 and cosine >= FLATTEST_COSINE):
+                clues[row, col, :] = 0.0
+                continue
             flip = -1.0 if along > 0.0 else 1.0
             nx, ny, nz = flip * nx / length, flip * ny / length, flip * nz / length
-            cosine = abs(along)
+            lateral[row, col] = pitch[0] * r + pitch[1]
             aside = ASIDE_CELLS * (pitch[0] * r + pitch[1])
-            if cosine < FLATTEST_COSINE:
-                continue
-            error = math.hypot(float(fit[row, col, 3]) * cosine, aside * math.sqrt(max(1.0 - cosine * cosine, 0.0)))
+            error = math.hypot(quiet * cosine, aside * math.sqrt(max(1.0 - cosine * cosine, 0.0)))
             feather = min(1.0, edge[row, col] / FEATHER_CELLS)
-            cells[i, 0], cells[i, 1], cells[i, 2] = r, 0.5 * su, 0.5 * sv
-            cells[i, 3] = feather * cosine / (error * error)
-            cells[i, 4] = rotation[0, 0] * nx + rotation[0, 1] * ny + rotation[0, 2] * nz
-            cells[i, 5] = rotation[1, 0] * nx + rotation[1, 1] * ny + rotation[1, 2] * nz
-            cells[i, 6] = rotation[2, 0] * nx + rotation[2, 1] * ny + rotation[2, 2] * nz
-            cells[i, 7], cells[i, 8] = cosine, (float(fit[row, col, 4]) * cosine) ** 2
+            record[0], record[1], record[2] = r, 0.5 * su, 0.5 * sv
+            record[3] = feather * cosine / (error * error)
+            record[4] = rotation[0, 0] * nx + rotation[0, 1] * ny + rotation[0, 2] * nz
+            record[5] = rotation[1, 0] * nx + rotation[1, 1] * ny + rotation[1, 2] * nz
+            record[6] = rotation[2, 0] * nx + rotation[2, 1] * ny + rotation[2, 2] * nz
+            record[7], record[8] = cosine, (factors[chosen[row, col] & CODES - 1] * quiet * cosine) ** 2
             for k in range(CLUES):
-                clues[i, k] = fit[row, col, 5 + k] * cosine * cosine
-            residual[i] = fit[row, col, 8] * cosine
+                clues[row, col, k] *= cosine * cosine
+            if chosen[row, col] >= 0:
+                residual[row, col] = (ranges[row, col] - r) * left_out[chosen[row, col] % STOPPED] * cosine
 
 
 @kernel
@@ -184,85 +187,108 @@ def _run(mask: BoolArray, axis: int, combine: np.ufunc) -> BoolArray:
 
 
 @dataclass(frozen=True)
-class _Prepared:
-    """One scan: kind, numbers (37,), records (h w, 10), and (h w,) each noise and lateral pitch, along the normal what is left of the sample
-    beside its fit, its clues (h w, CLUES), and whether a window wider than the narrowest was chosen."""
+class _Told:
+    """What is known of all cells beside their records, only while these are made: noise of one range, what is left of the sample beside its
+    fit along the normal, lateral pitch, all (n,); clues (n, CLUES); and whether a window wider than the narrowest was chosen (n,)."""
 
-    kind: int
-    numbers: FloatArray
-    cells: FloatArray
     noise_mm: FloatArray
-    lateral_mm: FloatArray
     residual: FloatArray
+    lateral_mm: FloatArray
     clues: FloatArray
     wide: BoolArray
 
+    @classmethod
+    def of(cls, n: int) -> _Told:
+        noise, residual, lateral = (np.empty(n, np.float32) for _ in range(3))
+        return cls(noise, residual, lateral, np.empty((n, CLUES), np.float32), np.empty(n, bool))
 
-def _cells_of(scan: RangeScan, pose: FloatArray, known: dict[Camera, tuple[FloatArray, FloatArray]]) -> _Prepared:
-    """One scan at `pose` (4, 4)."""
-    seen = projection_of(scan, known.get(scan.camera))
-    known.clear()
-    known[scan.camera] = seen.origins, seen.directions
-    back = rigid.inverse(pose)
-    fit, noise = quiet_ranges(seen.ranges, seen.pitch, scan.noise_mm, off=(seen.off_u, seen.off_v))
-    height, width = noise.shape
+
+def _fill_cells(scan: RangeScan, seen: Projection, cells: FloatArray, told: _Told, rows: slice) -> None:
+    """Fill the records `cells` (n, FIELDS), and what is told beside them, of the scan whose cells are `rows` of them."""
+    height, width = scan.range_mm.shape
+    mine = cells[rows].reshape(height, width, FIELDS)
+    fits = quiet_ranges(seen.ranges, seen.pitch, scan.noise_mm, off=(seen.off_u, seen.off_v), into=mine)
     edge = np.empty((height, width), np.float32)
-    _cells_from_edge(fit, seen.pitch, edge)
-    cells, clues = np.empty((height * width, FIELDS), np.float32), np.empty((height * width, CLUES), np.float32)
-    residual = np.empty(height * width, np.float32)
-    rotation = np.ascontiguousarray(pose[:3, :3])
+    _cells_from_edge(mine, seen.pitch, edge)
+    told.noise_mm[rows], told.wide[rows] = fits.noise_mm.ravel(), (fits.chosen >= 0).ravel()
+    told.wide[rows] &= (fits.chosen % STOPPED > 0).ravel()
+    clues = told.clues[rows].reshape(height, width, CLUES)
+    clues[...] = fits.clues
+    residual, lateral = (a[rows].reshape(height, width) for a in (told.residual, told.lateral_mm))
+    rotation = np.ascontiguousarray(scan.world_from_scan[:3, :3])
+    left_out = 1.0 / (1.0 - middle_weights())
     in_chunks(
-        lambda i, j: _records(fit, seen.origins, seen.directions, rotation, edge, seen.pitch, i, j, cells, clues, residual),
-        height,
-        32,
-    )
-    numbers = np.concatenate([back[:3, :3].ravel(), back[:3, 3], seen.numbers])
-    wide = (fit[..., 9] > 0).ravel()
-    return _Prepared(
-        seen.kind, numbers, cells, noise.ravel(), seen.pitch[0] * cells[:, RANGE] + seen.pitch[1], residual, clues, wide
-    )
+        lambda i, j: _records(
+            seen.ranges, fits.chosen, fits.factors, left_out, seen.origins, seen.directions, rotation, edge, seen.pitch, i, j, mine, clues,
+            residual, lateral,
+        ),
+        height, 32,
+    )  # fmt: skip
+
+
+def _points_of(scan: RangeScan, seen: Projection) -> FloatArray:
+    """(k, 3) samples in the world frame, as `RangeScan.points_mm` gives them, from the cells' rays if they are the measured ones."""
+    if isinstance(scan.camera, RayGrid):
+        return scan.points_mm()
+    ranges = scan.range_mm[scan.valid].astype(np.float64)
+    return rigid.move_points(scan.world_from_scan, seen.origins[scan.valid] + ranges[:, None] * seen.directions[scan.valid])
 
 
 def views_of(scans: Sequence[RangeScan]) -> Views:
     """Prepare the scans. Raises ScanError when none holds a surface, or a camera cannot be projected into."""
     if not scans:
         raise ScanError("there are no scans; a surface needs at least one")
-    samples = [scan.need_points(16).points_mm() for scan in scans]
-    shift = 0.5 * (np.min([p.min(axis=0) for p in samples], axis=0) + np.max([p.max(axis=0) for p in samples], axis=0))
-    points = np.concatenate(samples) - shift
+    starts = np.cumsum([0, *(scan.need_points(16).range_mm.size for scan in scans)])
+    cells, told = np.empty((starts[-1], FIELDS), np.float32), _Told.of(int(starts[-1]))
     known: dict[Camera, tuple[FloatArray, FloatArray]] = {}  # scans mostly share one camera
-    poses = [scan.world_from_scan.copy() for scan in scans]
-    for pose in poses:
-        pose[:3, 3] -= shift
-    parts = [_cells_of(scan, pose, known) for scan, pose in zip(scans, poses)]
-    spacings, own = [], []
-    starts = np.cumsum([0] + [len(part.cells) for part in parts[:-1]]).astype(np.int64)
-    for scan, part, start in zip(scans, parts, starts):
-        good = part.cells[:, WEIGHT] > 0
-        spacings.append(part.lateral_mm[good] / np.sqrt(part.cells[good, COSINE]))
+    kinds, cameras, samples, own = [], [], [], []
+    for scan, start, stop in zip(scans, starts[:-1], starts[1:]):
+        seen = projection_of(scan, known.get(scan.camera))
+        known.clear()
+        known[scan.camera] = seen.origins, seen.directions
+        kinds.append(seen.kind)
+        cameras.append(seen.numbers)
+        samples.append(_points_of(scan, seen))
         own.append(start + np.flatnonzero(scan.valid))
-    spacing = np.concatenate(spacings)
+        _fill_cells(scan, seen, cells, told, slice(int(start), int(stop)))
+    known.clear()
+    spacing = np.concatenate([_spacings(cells[i:j], told.lateral_mm[i:j]) for i, j in pairwise(starts)])
     if len(spacing) == 0:
         raise ScanError("the scans' samples lie too far apart to span a surface; check the unit, or use poisson or pivot")
+    shift = 0.5 * (np.min([p.min(axis=0) for p in samples], axis=0) + np.max([p.max(axis=0) for p in samples], axis=0))
+    numbers = []
+    for scan, camera in zip(scans, cameras):
+        pose = scan.world_from_scan.copy()
+        pose[:3, 3] -= shift
+        back = rigid.inverse(pose)
+        numbers.append(np.concatenate([back[:3, :3].ravel(), back[:3, 3], camera]))
     views = Views(
-        kind=np.array([part.kind for part in parts], np.int64),
-        numbers=np.array([part.numbers for part in parts]),
+        kind=np.array(kinds, np.int64),
+        numbers=np.array(numbers),
         size=np.array([scan.range_mm.shape for scan in scans], np.int64),
-        start=starts,
-        cells=np.concatenate([part.cells for part in parts]),
-        noise_mm=np.concatenate([part.noise_mm for part in parts]),
-        samples_mm=points,
+        start=starts[:-1].astype(np.int64),
+        cells=cells,
+        samples_mm=np.concatenate([points - shift for points in samples]),
         spacing_mm=float(np.median(spacing)),
         shift_mm=shift,
     )
-    residual, clues, wide = (np.concatenate([getattr(part, name) for part in parts]) for name in ("residual", "clues", "wide"))
-    del parts
-    views.cells[:, SMOOTHED] = detail_lost(
-        views.arrays, residual, clues, wide, views.noise_mm, points, np.concatenate(own), views.spacing_mm
-    )
-    for s, scan in enumerate(scans):
-        hit = scan.valid.copy()
-        _mark_hit(views.kind[s], views.numbers[s], *hit.shape, points, 2, hit)
+    detail_lost(
+        views.arrays, told.residual, told.clues, told.wide, told.noise_mm, views.samples_mm, np.concatenate(own), views.spacing_mm,
+        cells[:, SMOOTHED],
+    )  # fmt: skip
+
+    def empty_space(first: int, _: int) -> None:
+        hit = scans[first].valid.copy()
+        _mark_hit(views.kind[first], views.numbers[first], *hit.shape, views.samples_mm, 2, hit)
         # a ray that returned nothing, and on which no other scan saw anything, ran through empty space
-        views.cells[starts[s] : starts[s] + hit.size, RANGE][~_closed_up(hit).ravel()] = np.inf
+        cells[starts[first] : starts[first + 1], RANGE][~_closed_up(hit).ravel()] = np.inf
+
+    in_chunks(empty_space, len(scans), 1)
     return views
+
+
+def _spacings(cells: FloatArray, lateral: FloatArray) -> FloatArray:
+    """Distances along the surface between neighbouring samples, of the cells that have a weight."""
+    good = cells[:, WEIGHT] > 0
+    spacings: FloatArray = lateral[good] / np.sqrt(cells[good, COSINE])
+    return spacings
