@@ -330,4 +330,8 @@ def settings_from(config: str | None, assignments: tuple[str, ...], preset: str 
     settings = load_settings(config, assignments, {key.replace("__", "."): value for key, value in overrides.items()}, preset)
     if settings.memory_mb is not None:
         click.get_current_context().call_on_close(bound_memory(settings.memory_mb))
+    if settings.threads and not click.get_current_context().params.get("threads"):
+        from rangecheck import kernels
+
+        kernels.set_threads(settings.threads)
     return settings

@@ -131,8 +131,13 @@ def read_bytes(path: str | Path, limit: int | None = None) -> bytes:
 
 
 def sha256(path: str | Path) -> str:
-    """Hex digest of a file's content."""
-    return hashlib.sha256(read_bytes(path)).hexdigest()
+    """Hex digest of a file's content, of which no more than a piece is held. Raises InputError."""
+    path = Path(path)
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror})") from None
 
 
 def presets_folder() -> Path:

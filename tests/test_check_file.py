@@ -5,13 +5,14 @@ import pytest
 from test_topology import torus
 from test_topology_distance import CUBE_CORNERS, CUBE_FACES, cube
 
+from rangecheck import memory
 from rangecheck.errors import InputError
 from rangecheck.export.meshes import write_mesh
 from rangecheck.export.stl import write_stl
 from rangecheck.files import write_json
 from rangecheck.solid import Solid
 from rangecheck.solid.check_file import check_mesh_file
-from rangecheck.solid.opinions import disagreements, second_opinions
+from rangecheck.solid.opinions import TOO_LITTLE, disagreements, second_opinions
 from rangecheck.solid.printer import printer
 from rangecheck.solid.shape import shape_findings
 from rangecheck.surface import Surface
@@ -111,6 +112,25 @@ def test_a_solid_file_is_judged_for_printing_too_and_all_of_it_is_json(tmp_path)
     said = check_mesh_file(tmp_path / "c.ply", "mm", printer=printer("prusa-sl1s"), up=(0, 0, 1)).verdict
     assert said.fit and said.facts["printing"]["contact_area_mm2"] == pytest.approx(400)
     write_json(tmp_path / "c.json", said.to_dict())
+
+
+def test_with_little_memory_a_check_finds_the_same_and_says_what_it_left_out(tmp_path, monkeypatch):
+    write_mesh(torus(24, 16), tmp_path / "torus.ply")
+    whole = check_mesh_file(tmp_path / "torus.ply").verdict
+    monkeypatch.setattr("rangecheck.memory._most_mb", 1.0)
+    bounded = check_mesh_file(tmp_path / "torus.ply", printer=printer("prusa-sl1s")).verdict
+    left = bounded.get("left-out")
+    assert left.severity == "note" and "manifold3d and printing" in left.message and bounded.fit
+    assert [f for f in bounded.findings if f is not left] == list(whole.findings)
+    assert bounded.facts == dict(whole.facts) | {"engine_asked": False}
+
+
+def test_programs_that_do_not_fit_into_memory_say_so_and_others_are_heard(tmp_path, monkeypatch):
+    write_mesh(torus(24, 16), tmp_path / "torus.ply")
+    monkeypatch.setattr("rangecheck.memory._most_mb", memory.held_mb() + 30.0)
+    assert {opinion.error for opinion in second_opinions(tmp_path / "torus.ply", torus(24, 16))[1:]} == {TOO_LITTLE}
+    monkeypatch.setattr("rangecheck.memory._most_mb", memory.held_mb() + 8000.0)
+    assert [opinion.closed for opinion in second_opinions(tmp_path / "torus.ply", torus(24, 16))] == [True] * 4
 
 
 def test_folds_slivers_and_short_edges_are_named():

@@ -5,6 +5,8 @@ import json
 import re
 import subprocess
 import sys
+import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import click
@@ -176,6 +178,20 @@ def test_a_command_that_passes_its_memory_ends_and_says_so(tmp_path):
     done = subprocess.run([sys.executable, "-m", "rangecheck_cli", *line], capture_output=True, text=True)
     assert done.returncode == 2 and "out of memory" in done.stderr and len(done.stderr.splitlines()) == 1
     assert [path.name for path in tmp_path.iterdir()] == ["ball.ply"]
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the memory of processes is read from /proc")
+def test_what_a_command_started_counts_and_ends_with_it(tmp_path):
+    child = f"import os, time; open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid())); held = bytearray(300_000_000); time.sleep(60)"
+    parent = "import subprocess, sys; from rangecheck_cli.memory import bound_memory; bound_memory(200); "
+    parent += f"subprocess.run([sys.executable, '-c', {child!r}])"
+    done = subprocess.run([sys.executable, "-c", parent], capture_output=True, text=True)
+    assert done.returncode == 2 and "out of memory" in done.stderr and len(done.stderr.splitlines()) == 1
+    gone = Path("/proc") / (tmp_path / "pid").read_text() / "stat"
+    until = time.monotonic() + 20
+    while gone.exists() and gone.read_text().split()[2] != "Z":  # what was killed gives its memory back first
+        assert time.monotonic() < until
+        time.sleep(0.01)
 
 
 @pytest.mark.parametrize("command", [["solid"], ["mesh"], ["run"], ["maps"], ["dataset", "--count", "1"]])

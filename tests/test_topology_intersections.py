@@ -1,7 +1,7 @@
 """Where surfaces run through themselves: signs against rational arithmetic, meetings against clipping, known solids."""
 
 from fractions import Fraction
-from itertools import permutations
+from itertools import combinations, permutations
 
 import numpy as np
 import pytest
@@ -14,6 +14,7 @@ from rangecheck.surface import Surface
 from rangecheck.surface.intersections import APART, CROSSING, OVERLAP, TOUCHING, meeting, self_intersections
 from rangecheck.surface.predicates import side_of_line, side_of_plane
 from rangecheck.surface.surface import join
+from rangecheck.surface.tree import blocks_of
 
 
 def exact(points):
@@ -167,6 +168,43 @@ def test_every_pair_of_a_soup_is_found_whatever_the_threads():
         with kernels.threads(count):
             found = self_intersections(Surface(soup.reshape(-1, 3), np.arange(360).reshape(-1, 3)))
         assert [tuple(p) for p in found.pairs.tolist()] == expected
+
+
+def soup(n=900, seed=3):
+    """Triangles of several sizes anywhere on a grid of whole numbers, a quarter in one plane, so that many touch and overlap."""
+    random = np.random.default_rng(seed)
+    corners = random.uniform(-30, 30, (n, 1, 3)) + random.normal(0, random.choice([1.0, 2.0, 6.0], (n, 1, 1)), (n, 3, 3))
+    corners[: n // 4, :, 2] = 0.0
+    return Surface(np.round(corners).reshape(-1, 3), np.arange(3 * n).reshape(-1, 3))
+
+
+def test_faces_that_have_a_point_in_common_come_together_in_some_block():
+    scattered = soup()
+    blocks = list(blocks_of(scattered.vertices, scattered.faces, 60))
+    assert len(blocks) > 6 and max(map(len, blocks)) < len(scattered.faces)
+    together = {pair for block in blocks for pair in combinations(sorted(block.tolist()), 2)}
+    corners = scattered.triangles
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    near = {(i, j) for i, j in combinations(range(len(low)), 2) if (low[i] <= high[j]).all() and (low[j] <= high[i]).all()}
+    assert len(near) > 1000 and near <= together
+
+
+def test_block_by_block_the_same_faces_meet(monkeypatch):
+    far = Surface(soup().vertices + (1e4, 0.25, 0.0), soup().faces)
+    whole = self_intersections(far)
+    monkeypatch.setattr("rangecheck.surface.intersections.FACES_OF_BLOCK", 50)
+    parted = self_intersections(far)
+    assert len(whole.pairs) > 100 and {CROSSING, TOUCHING, OVERLAP} <= set(whole.kind.tolist())
+    assert np.array_equal(whole.pairs, parted.pairs) and np.array_equal(whole.kind, parted.kind)
+
+
+def test_a_fan_that_no_plane_parts_is_one_block():
+    turn = np.linspace(0, 2 * np.pi, 200, endpoint=False)
+    rim = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(200)])
+    fan = Surface(
+        np.vstack([np.zeros((1, 3)), rim, -rim]), np.column_stack([np.arange(1, 201), np.arange(201, 401), np.zeros(200, int)])
+    )
+    assert [len(block) for block in blocks_of(fan.vertices, fan.faces, 10)] == [200]
 
 
 @pytest.mark.parametrize("count", [0, 1])

@@ -5,7 +5,7 @@ Unknown keys are refused with the nearest known name. Lengths in millimetres, an
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -222,7 +222,7 @@ class Settings(Section):
     threads: Annotated[int, Field(ge=0, le=1024)] = Field(0, description="0 means all cores; results do not depend on it")
     memory_mb: Annotated[float, Field(ge=256, allow_inf_nan=False)] | None = Field(
         None,
-        description="most memory that a command may take; one that needs more ends and says so. Without it, what the machine has",
+        description="most memory that a command, with all that it starts, may take; one that needs more ends and says so. Without it, what the machine has. Results do not depend on it",
     )
     scan: Scanning = Scanning()
     meshing: Meshing = Meshing()
@@ -233,3 +233,7 @@ class Settings(Section):
     turntable: Turntable = Turntable()
     maps: Maps = Maps()
     checking: Checking = Checking()
+
+    def determining(self) -> dict[str, Any]:
+        """What results depend on, JSON-ready: all but how many threads and how much memory it takes to make them."""
+        return self.model_dump(mode="json", exclude={"threads", "memory_mb"})

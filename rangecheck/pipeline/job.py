@@ -63,7 +63,7 @@ def run(
             ready = prepared(measured, settings, reporter, quality=settings.scan.quality, aside=early)
         except PosesRefused as refusal:
             return refused("run", refusal, reporter)
-        key = key_of(inputs=inputs, unit=unit, settings=settings.model_dump(mode="json"), versions=versions())
+        key = key_of(inputs=inputs, unit=unit, settings=settings.determining(), versions=versions())
         # the thread ends before the folder is given free, however the job ends
         with job_folder(out, key, FINISHED, force=force) as folder, _one_thread() as aside:
             outcome = _made(ready, folder, aside, settings, reporter, inputs=inputs, force=force, scheduler=scheduler)

@@ -70,7 +70,7 @@ def _made(job: Subjects, scheduler: str | None, reporter: Reporter) -> Iterator[
 
     with Farm(scheduler) as farm:
         reporter.note(f"subjects are made at {scheduler} by {farm.threads()} threads")
-        key = key_of(scans=job.scans, folders=job.folders, settings=job.settings.model_dump(mode="json"), unit=job.unit)
+        key = key_of(scans=job.scans, folders=job.folders, settings=job.settings.determining(), unit=job.unit)
         yield from farm.spread(subjects_of, job, key)(range(len(job.scans)))
 
 

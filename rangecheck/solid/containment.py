@@ -7,7 +7,6 @@ their signed solid angles divided by 4 pi: 1 inside, 0 outside, -1 inside a shel
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 
 import numpy as np
 
@@ -17,14 +16,14 @@ from rangecheck.surface.surface import Surface
 
 
 @kernel
-def solid_angle(corners, x, y, z):
-    """Sum of the signed solid angles of triangles (m, 9) seen from a point, steradians, positive where their backs are seen."""
+def solid_angle_of(vertices, faces, chosen, x, y, z):
+    """Sum of the signed solid angles of some faces seen from a point, steradians, positive where their backs are seen."""
     total = 0.0
-    for i in range(len(corners)):
-        t = corners[i]
-        ax, ay, az = t[0] - x, t[1] - y, t[2] - z
-        bx, by, bz = t[3] - x, t[4] - y, t[5] - z
-        cx, cy, cz = t[6] - x, t[7] - y, t[8] - z
+    for f in chosen:
+        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+        ax, ay, az = vertices[i, 0] - x, vertices[i, 1] - y, vertices[i, 2] - z
+        bx, by, bz = vertices[j, 0] - x, vertices[j, 1] - y, vertices[j, 2] - z
+        cx, cy, cz = vertices[k, 0] - x, vertices[k, 1] - y, vertices[k, 2] - z
         a = math.sqrt(ax * ax + ay * ay + az * az)
         b = math.sqrt(bx * bx + by * by + bz * bz)
         c = math.sqrt(cx * cx + cy * cy + cz * cz)
@@ -36,12 +35,13 @@ def solid_angle(corners, x, y, z):
 
 def winding_numbers(surface: Surface, points_mm: FloatArray) -> FloatArray:
     """(n,) winding number of `surface` about each point (n, 3). Cost n times the number of faces."""
-    corners = surface.triangles.reshape(-1, 9)
+    vertices, faces = surface.vertices, surface.faces
 
     def sums(first: int, last: int) -> FloatArray:
-        return np.array([solid_angle(corners[first:last], p[0], p[1], p[2]) for p in points_mm])
+        chosen = np.arange(first, last, dtype=np.int32)
+        return np.array([solid_angle_of(vertices, faces, chosen, p[0], p[1], p[2]) for p in points_mm])
 
-    pieces = in_chunks(sums, len(corners), 1 << 16)
+    pieces = in_chunks(sums, len(faces), 1 << 16)
     return np.sum(pieces, axis=0) / (4 * np.pi) if pieces else np.zeros(len(points_mm))
 
 
@@ -74,16 +74,29 @@ def shell_depths(surface: Surface, count: int, shell: IntArray) -> IntArray:
     face exactly, its first vertex; only shells whose box holds its own are looked at."""
     if count < 2:
         return np.zeros(count, np.int64)
-    order = np.argsort(shell, kind="stable")
-    start = np.searchsorted(shell[order], np.arange(count + 1))
-    pieces = [surface.triangles[order[a:b]].reshape(-1, 9) for a, b in pairwise(start)]
-    low = np.array([p.reshape(-1, 3).min(axis=0) for p in pieces]).reshape(-1, 3)
-    high = np.array([p.reshape(-1, 3).max(axis=0) for p in pieces]).reshape(-1, 3)
+    boxes = boxes_of_shells(surface.vertices, surface.faces, shell, count)
+    low, high = boxes[:, 0], boxes[:, 1]
     depth = np.zeros(count, np.int64)
+    order = np.argsort(shell, kind="stable").astype(np.int32)
+    start = np.searchsorted(shell, np.arange(count + 1), sorter=order)
     for i in range(count):
-        x, y, z = pieces[i][0, :3]
+        x, y, z = surface.vertices[surface.faces[order[start[i]], 0]]
         # one that only runs into another is not inside it: a box within a box is the least that inside means
         around = np.flatnonzero(((low <= low[i]) & (high >= high[i])).all(axis=1))
         for j in around[around != i]:
-            depth[i] += abs(round(solid_angle(pieces[j], x, y, z) / (4 * math.pi))) % 2
+            mine = order[start[j] : start[j + 1]]
+            depth[i] += abs(round(solid_angle_of(surface.vertices, surface.faces, mine, x, y, z) / (4 * math.pi))) % 2
     return depth
+
+
+@kernel
+def boxes_of_shells(vertices, faces, shell, count):
+    """(count, 2, 3) low and high corner of the box around each shell."""
+    boxes = np.empty((count, 2, 3))
+    boxes[:, 0], boxes[:, 1] = np.inf, -np.inf
+    for f in range(len(faces)):
+        for corner in range(3):
+            for axis in range(3):
+                value, s = vertices[faces[f, corner], axis], shell[f]
+                boxes[s, 0, axis], boxes[s, 1, axis] = min(boxes[s, 0, axis], value), max(boxes[s, 1, axis], value)
+    return boxes

@@ -1,7 +1,7 @@
 """One foreign program's opinion of one mesh, asked in a process of its own: a crash there is an answer, and its memory is given back.
 
-Run as a script, `judges.py PROGRAM SOURCE [ASK]`, it writes one JSON document to stdout; ASK is "intersections" where MeshLab shall look for these
-too. SOURCE is a mesh file, or a folder with `vertices.npy` (n, 3) and `faces.npy` (m, 3): the records of an STL file whose corners
+Run as a script, `judges.py PROGRAM SOURCE ASK [MOST_MB]`, it writes one JSON document to stdout; ASK is "intersections" where MeshLab shall look for
+these too, and MOST_MB bounds what it may take (10^6 bytes). SOURCE is a mesh file, or a folder with `vertices.npy` (n, 3) and `faces.npy` (m, 3): the records of an STL file whose corners
 are equal bit for bit made one vertex. MeshLab and trimesh merge such corners themselves, and are asked to here too, so that this changes
 nothing of what they say; it saves them from sorting millions of corners. Nothing of rangecheck is imported: what is to be loaded before the
 first answer is the program itself.
@@ -9,7 +9,9 @@ first answer is the program itself.
 
 from __future__ import annotations
 
+import importlib
 import json
+import resource
 import sys
 from pathlib import Path
 from typing import Any
@@ -80,7 +82,10 @@ PROGRAMS = {"trimesh": trimesh_says, "MeshLab": meshlab_says, "manifold3d": mani
 
 if __name__ == "__main__":
     try:
-        said = PROGRAMS[sys.argv[1]](Path(sys.argv[2]), "".join(sys.argv[3:]))
+        importlib.import_module(sys.argv[1].replace("MeshLab", "pymeshlab"))  # absent, or there: before memory may end
+        if sys.argv[4:]:
+            resource.setrlimit(resource.RLIMIT_AS, (int(float(sys.argv[4]) * 1e6),) * 2)
+        said = PROGRAMS[sys.argv[1]](Path(sys.argv[2]), sys.argv[3])
     except ImportError as absent:
         said = {"error": f"not installed; pip install {absent.name}"}
     except Exception as raised:  # a foreign reader may raise anything

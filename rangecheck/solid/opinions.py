@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -24,6 +25,7 @@ from typing import Any
 
 import numpy as np
 
+from rangecheck import memory
 from rangecheck.arrays import FloatArray
 from rangecheck.solid import judges
 from rangecheck.solid.findings import Finding, finding
@@ -36,6 +38,9 @@ TRIMESH_DECIMALS = 8
 TIMEOUT_S = 120
 #: programs that think at the same time, beside the caller
 TOGETHER = 2
+#: the error of a program that was given a bound which it passed, and how programs end then, unless by a signal
+TOO_LITTLE = "needs more memory than memory_mb leaves for it; a higher memory_mb lets it answer"
+_STARVED = re.compile("bad_alloc|[Mm]emory|not map|map segment")
 _NONE = np.empty(0, np.int64)
 
 
@@ -63,13 +68,15 @@ class Judges:
     def __init__(
         self, path: str | Path, surface: Surface, *, records: FloatArray | None = None, intersections: bool = True
     ) -> None:
-        """Asks about `surface`, which was read from `path`. Of binary STL, `records` (n, 3) are its vertices as the file has them."""
+        """Asks about `surface`, which was read from `path`. Of binary STL, `records` (n, 3) are its vertices as the file has them.
+
+        Where memory is bounded they think one at a time, in what is left; one that finds that too little gives no answer and says so."""
         self._own = Opinion(
             "rangecheck", topo.is_closed(surface), {"vertices": len(surface.vertices), "faces": len(surface.faces)}
         )
         self._folder = tempfile.TemporaryDirectory()
         self._running: list[subprocess.Popen[str]] = []
-        self._pool = ThreadPoolExecutor(TOGETHER)
+        self._pool = ThreadPoolExecutor(1 if memory.bounded() else TOGETHER)
         welded = _saved(Path(self._folder.name) / "welded", surface, surface.vertices)
         given = Path(path) if records is None else _saved(Path(self._folder.name) / "records", surface, records)
         meshlab = self._pool.submit(self._ask, "MeshLab", given, intersections)
@@ -114,11 +121,19 @@ def _saved(folder: Path, surface: Surface, vertices: FloatArray) -> Path:
 
 def begin(program: str, source: str | Path, *, intersections: bool = False) -> subprocess.Popen[str]:
     """One program's process, begun on a mesh file or a folder of arrays (see judges.py)."""
-    command = [sys.executable, "-P", judges.__file__, program, str(Path(source).resolve())]
+    command = [
+        sys.executable,
+        "-P",
+        judges.__file__,
+        program,
+        str(Path(source).resolve()),
+        "intersections" if intersections else "-",
+    ]
     quiet = {**os.environ, "QT_QPA_PLATFORM": "offscreen"}
-    return subprocess.Popen(
-        command + ["intersections"] * intersections, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=quiet
-    )
+    if memory.bounded():
+        command.append(str(memory.left_mb()))
+        quiet |= {"MALLOC_ARENA_MAX": "2"}  # each would reserve more than it uses
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=quiet)
 
 
 def answer(program: str, process: subprocess.Popen[str]) -> Opinion:
@@ -131,13 +146,14 @@ def answer(program: str, process: subprocess.Popen[str]) -> Opinion:
         return Opinion(program, None, error=f"gave no answer in {TIMEOUT_S} s")
     if process.returncode != 0:
         last = errors.strip().splitlines()[-1:] or [f"ended with status {process.returncode}"]
-        return Opinion(program, None, error=last[0][:200])
+        starved = process.returncode < 0 or _STARVED.search(last[0])
+        return Opinion(program, None, error=TOO_LITTLE if memory.bounded() and starved else last[0][:200])
     said = json.loads(out.strip().splitlines()[-1])
     return Opinion(
         program,
         said.get("closed"),
         said.get("facts", {}),
-        said.get("error"),
+        TOO_LITTLE if memory.bounded() and _STARVED.search(said.get("error") or "") else said.get("error"),
         tuple(said.get("crossing", ())),
         said.get("faces", 0),
     )

@@ -65,6 +65,11 @@ def edge_table(surface: Surface | IntArray) -> EdgeTable:
     return table
 
 
+def forget_edges(surface: Surface) -> None:
+    """Keep the edges of a surface no longer: of a large mesh they are more than the mesh."""
+    _tables.pop(surface, None)
+
+
 def _found_edges(faces: IntArray, vertex_count: int) -> EdgeTable:
     halves, low, high = sorted_half_edges(faces, vertex_count)
     ends, start, along, edge_of_half = grouped_half_edges(faces, halves, low, high)

@@ -19,12 +19,14 @@ from rangecheck.arrays import IntArray
 from rangecheck.kernels import in_chunks, inline_kernel, kernel
 from rangecheck.surface.predicates import same_point, side_of_line, side_of_plane
 from rangecheck.surface.surface import Surface
-from rangecheck.surface.tree import triangle_tree
+from rangecheck.surface.tree import TriangleTree, binary_centre, blocks_of, tree_over, triangle_tree
 
 APART, CROSSING, OVERLAP, TOUCHING = 0, 1, 2, 3
 KIND_NAMES = ("apart", "crossing", "overlap", "touching")
 #: level of the tree whose nodes are tasks of their own
 _TASK_LEVEL = 8
+#: more faces than this are looked at in blocks of about so many
+FACES_OF_BLOCK = 1 << 21
 
 
 class Intersections(NamedTuple):
@@ -47,11 +49,31 @@ class Intersections(NamedTuple):
 
 
 def self_intersections(surface: Surface) -> Intersections:
-    """All pairs of faces of `surface` that cross, overlap or touch."""
+    """All pairs of faces of `surface` that cross, overlap or touch. Of large meshes the faces are looked at block by block, so that the boxes
+    around those of one block are all that is held beside the mesh; what is found is the same."""
     if len(surface.faces) < 2:
         return Intersections(np.empty((0, 2), np.int32), np.empty(0, np.uint8))
-    tree = triangle_tree(surface)
+    if len(surface.faces) <= FACES_OF_BLOCK:
+        return _ascending(_meeting_in(triangle_tree(surface)))
+    centre = binary_centre(surface)
+    local = surface.vertices - centre
+    found = []
+    for block in blocks_of(local, surface.faces, FACES_OF_BLOCK):
+        met = _meeting_in(tree_over(local, surface.faces[block], centre))
+        found.append(np.column_stack([block[met[:, :2]], met[:, 2]]))
+    # faces at a border belong to both blocks
+    return _ascending(np.unique(np.concatenate(found), axis=0))
 
+
+def _ascending(found: IntArray) -> Intersections:
+    """Rows (face, face, kind) in any order."""
+    pairs = np.sort(found[:, :2], axis=1)
+    ascending = np.lexsort((pairs[:, 1], pairs[:, 0]))
+    return Intersections(pairs[ascending], found[ascending, 2].astype(np.uint8))
+
+
+def _meeting_in(tree: TriangleTree) -> IntArray:
+    """(k, 3) int32 rows (face, face, kind), the lower face first, of the faces of a tree."""
     flat = np.concatenate(in_chunks(lambda first, last: flat_faces(tree.corners[first:last]), len(tree.order), 1 << 16))
 
     level = min(_TASK_LEVEL, tree.depth)
@@ -65,9 +87,8 @@ def self_intersections(surface: Surface) -> Intersections:
         return found[:count]
 
     found = np.concatenate(in_chunks(search, 1 << level, 1))
-    pairs = np.sort(tree.order[found[:, :2]], axis=1)
-    ascending = np.lexsort((pairs[:, 1], pairs[:, 0]))
-    return Intersections(pairs[ascending], found[ascending, 2].astype(np.uint8))
+    found[:, :2] = np.sort(tree.order[found[:, :2]], axis=1)
+    return found
 
 
 @kernel

@@ -9,6 +9,7 @@ float32 coordinates to the centre rounds nothing.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from weakref import WeakKeyDictionary
 
@@ -23,6 +24,8 @@ FACES_PER_LEAF = 4
 #: levels split on one thread before subtrees are handed to several
 _SHARED_LEVELS = 3
 _CHUNK = 1 << 16
+#: halves that together hold more than this many times their whole are not worth parting
+_WORTH_PARTING = 1.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,21 +57,31 @@ def triangle_tree(surface: Surface) -> TriangleTree:
 
 
 def _build(surface: Surface) -> TriangleTree:
-    n = len(surface.faces)
-    if n == 0:
+    if len(surface.faces) == 0:
         raise SurfaceError("the surface has no faces; there is nothing to measure against")
-    depth = max(0, math.ceil(math.log2(n / FACES_PER_LEAF)))
+    centre = binary_centre(surface)
+    return tree_over(surface.vertices - centre, surface.faces, centre)
+
+
+def binary_centre(surface: Surface) -> FloatArray:
+    """(3,) about the middle of a surface, with few binary digits."""
     step = 2.0 ** (math.floor(math.log2(max(surface.extent_mm, 2.0**-126))) - 2)
-    centre = np.round(surface.bounds_mm.mean(axis=0) / step) * step
-    local = surface.vertices - centre
+    centre: FloatArray = np.round(surface.bounds_mm.mean(axis=0) / step) * step
+    return centre
+
+
+def tree_over(local: FloatArray, faces: IntArray, centre_mm: FloatArray) -> TriangleTree:
+    """The tree over faces (n, 3), at least one, of vertices that are given relative to `centre_mm`."""
+    n = len(faces)
+    depth = max(0, math.ceil(math.log2(n / FACES_PER_LEAF)))
     keys, corners = np.empty((n, 3)), np.empty((n, 9))
-    in_chunks(lambda first, last: sums_of_corners(local, surface.faces, first, last, keys), n, _CHUNK)
+    in_chunks(lambda first, last: sums_of_corners(local, faces, first, last, keys), n, _CHUNK)
     order = np.arange(n, dtype=np.int32)
     shared = min(_SHARED_LEVELS, depth)
     arrange(keys, order, 0, 0, shared, depth)
     if depth > shared:
         in_chunks(lambda first, _: arrange(keys, order, shared, first, depth, depth), 1 << shared, 1)
-    in_chunks(lambda first, last: gathered(local, surface.faces, order, first, last, corners), n, _CHUNK)
+    in_chunks(lambda first, last: gathered(local, faces, order, first, last, corners), n, _CHUNK)
     boxes = np.empty(((2 << depth) - 1, 6))
     leaves = 1 << depth
     in_chunks(lambda first, last: leaf_boxes(corners, depth, first, last, boxes), leaves, 1 << 14)
@@ -77,7 +90,54 @@ def _build(surface: Surface) -> TriangleTree:
         here = boxes[(1 << level) - 1 : (2 << level) - 1]
         np.minimum(below[:, 0, :3], below[:, 1, :3], out=here[:, :3])
         np.maximum(below[:, 0, 3:], below[:, 1, 3:], out=here[:, 3:])
-    return TriangleTree(order, corners, boxes, depth, centre)
+    return TriangleTree(order, corners, boxes, depth, centre_mm)
+
+
+def blocks_of(vertices: FloatArray, faces: IntArray, most: int) -> Iterator[IntArray]:
+    """Faces (k,) int32, about `most` at a time, so that any two that have a point in common come together at least once: halved at planes,
+    those that a plane cuts or touches on both sides. Where planes part little, as of a fan around one vertex, there are more at a time."""
+    waiting: list[IntArray] = [np.arange(len(faces), dtype=np.int32)]
+    while waiting:
+        mine = waiting.pop()
+        halves = _parted(vertices, faces, mine) if len(mine) > most else None
+        if halves is None:
+            yield mine
+        else:
+            waiting += halves
+
+
+def _parted(vertices: FloatArray, faces: IntArray, mine: IntArray) -> list[IntArray] | None:
+    low, high = np.empty(len(mine)), np.empty(len(mine))
+    bounds = bounds_of_faces(vertices, faces, mine)
+    for axis in np.argsort(bounds[0] - bounds[1], kind="stable"):
+        extremes_of_faces(vertices, faces, mine, axis, low, high)
+        plane = np.partition(low, len(low) // 2)[len(low) // 2]
+        before, behind = mine[low <= plane], mine[high >= plane]
+        if len(before) + len(behind) <= _WORTH_PARTING * len(mine):
+            return [behind, before]
+    return None
+
+
+@kernel
+def bounds_of_faces(vertices, faces, chosen):
+    """(2, 3) low and high corner of the box around some faces."""
+    bounds = np.empty((2, 3))
+    bounds[0], bounds[1] = np.inf, -np.inf
+    for f in chosen:
+        for corner in range(3):
+            for axis in range(3):
+                value = vertices[faces[f, corner], axis]
+                bounds[0, axis], bounds[1, axis] = min(bounds[0, axis], value), max(bounds[1, axis], value)
+    return bounds
+
+
+@kernel
+def extremes_of_faces(vertices, faces, chosen, axis, low, high):
+    """Lowest and highest coordinate of some faces along an axis."""
+    for k in range(len(chosen)):
+        f = chosen[k]
+        a, b, c = vertices[faces[f, 0], axis], vertices[faces[f, 1], axis], vertices[faces[f, 2], axis]
+        low[k], high[k] = min(a, b, c), max(a, b, c)
 
 
 @kernel
