@@ -12,8 +12,9 @@ bend_sd is taken per place, the smallest for which range minus heights stays noi
 away than noise can be, the surface is let bend more (Lepskii's rule). Noise of neighbours must be independent.
 
 Albedo and shape cannot be told apart by one picture at fine scale, but at coarse scale the range tells the shape: where the brightness, averaged,
-differs from what the range's own shape predicts, the surface is painted, and the picture is not used there. Where that is too large a
-share, `refine` refuses.
+differs from what the range's own shape predicts, the surface is painted, and the picture is not used there (each cell's difference is bounded, so that
+folds as narrow as cells are not taken for paint). Where that is too large a share, `refine` refuses. Where heights that suit the picture leave the range
+by more than noise, the picture's noise is taken for larger, step by step, until they no longer do.
 """
 
 from __future__ import annotations
@@ -45,12 +46,22 @@ _WINDOW, _NOISE_SIGMAS = 1.5, 3.0
 _MOST_ENERGY = 1.8
 #: cells over which brightness is compared with the shading of the range, and the share by which paint-free brightness may differ there
 _COARSE, _PAINT = 5.0, 0.05
+#: difference of one cell that counts at most: folds as narrow as cells differ by much, paint is all of one side
+_CLIPPED = 0.1
+#: difference from which a cell is off, where half of the cells around it are
+_SPECK = 0.2
 #: cells over which albedo may change without being called paint
 _SLOW = 30.0
 #: share of the well-lit cells that may be painted before the picture is refused
 MOST_PAINTED = 0.35
-_STEPS, _DOUBTS, _BEND = 5, 4, 2.0
-_STEEPEST = 5.7
+_STEPS, _BEND = 5, 2.0
+#: rounds in which the picture's noise is taken for larger where it strains the range, by this factor; times it from which the picture has no say
+_DOUBTS, _DOUBT, _LOST = 6, 2.0, 8.0
+#: what is taken away that is no noise of tens of thousands of windows, as _NOISE_SIGMAS and _MOST_ENERGY are of one
+_DOUBT_SIGMAS, _DOUBT_ENERGY = 4.0, 2.2
+#: share of the brightness that lamp and albedo leave uncertain
+_LAMP = 0.01
+_STEEPEST, _STEP_SIGMAS = 5.7, 4.0
 #: noise of slanted cells that is believed, in that of cells seen face on
 _SLANTED = 1.25
 _LEAST_LIGHT, _LEAST_COSINE = 0.25, 0.2
@@ -84,12 +95,7 @@ def refine(scan: RangeScan, *, fitted: Fitted | None = None, noise_mm: float | N
     shape from paint."""
     grid = scan_grid(scan)
     noise = _noise(scan, noise_mm)
-    heights = height_grid(
-        np.where(grid.valid, scan.range_mm, np.nan).astype(float),
-        grid.rays,
-        _STEEPEST,
-        4.0 * noise / np.nan_to_num(scan.range_mm, nan=1.0),
-    )
+    heights = _heights(scan, grid, noise)
     measured = np.log(scan.range_mm.astype(float)).reshape(-1)[heights.cell]
     sigma = (noise / scan.range_mm).reshape(-1)[heights.cell]
     model = _Model(heights, measured, sigma, _bend_unit(grid, heights))
@@ -111,15 +117,32 @@ def refine(scan: RangeScan, *, fitted: Fitted | None = None, noise_mm: float | N
             "use the scan unrefined",
             name=scan.name, painted=float(painted.sum() / lit),
         )  # fmt: skip
-    alone = q
+    # a lamp and an albedo are not known better than a few per cent
+    noise_seen = np.hypot(spread, _LAMP * shading.seen)
     for _ in range(_DOUBTS):
-        q = model.with_picture(q, shading, believed, albedo, spread)
-        # where picture and range cannot both be right within their noise the range is
-        doubted = model.strained(q)[heights.inner] & ~model.strained(alone)[heights.inner] & believed
+        q = model.with_picture(q, shading, believed, albedo, noise_seen)
+        # where picture and range cannot both be right within their noise the picture is believed less: folds as narrow as cells, rims of paint
+        doubted = model.strained(q, _DOUBT_SIGMAS, _DOUBT_ENERGY)[heights.inner] & believed
         if not doubted.any():
             break
+        noise_seen = np.where(doubted, _DOUBT * noise_seen, noise_seen)
+    else:
         believed, painted = believed & ~doubted, painted | doubted
+        q = model.with_picture(q, shading, believed, albedo, noise_seen)
+    lost = believed & (noise_seen > _LOST * np.hypot(spread, _LAMP * shading.seen))
+    believed, painted = believed & ~lost, painted | lost
     return _done(scan, heights, q, heights.inner[believed], heights.inner[painted], noise, spread, fitted)
+
+
+def linked(scan: RangeScan, noise_mm: FloatArray) -> BoolArray:
+    """(h, w) cells whose four neighbours returned and lie on the same surface. noise_mm (h, w): of range."""
+    heights = _heights(scan, scan_grid(scan), noise_mm)
+    return np.asarray(np.isin(np.arange(scan.range_mm.size), heights.cell[heights.inner]).reshape(scan.range_mm.shape))
+
+
+def _heights(scan: RangeScan, grid: ScanGrid, noise: FloatArray) -> HeightGrid:
+    ranges = np.where(grid.valid, scan.range_mm, np.nan).astype(float)
+    return height_grid(ranges, grid.rays, _STEEPEST, _STEP_SIGMAS * noise / np.nan_to_num(scan.range_mm, nan=1.0))
 
 
 def _noise(scan: RangeScan, noise_mm: float | None) -> FloatArray:
@@ -166,7 +189,7 @@ class _Model:
         self.matrix = self._prior()
         return solve(self.matrix, self.measured / self.sigma**2, q, self.sigma)
 
-    def strained(self, q: FloatArray) -> BoolArray:
+    def strained(self, q: FloatArray, sigmas: float = _NOISE_SIGMAS, most: float = _MOST_ENERGY) -> BoolArray:
         """(n,) cells around which what was taken away is no noise."""
         from scipy.ndimage import maximum_filter
 
@@ -175,16 +198,16 @@ class _Model:
         # mean over a Gaussian window has 1 / (2 sqrt(pi) w) of the noise of one cell
         away = np.nan_to_num(masked_gauss(taken, ones, _WINDOW)) * 2.0 * np.sqrt(np.pi) * _WINDOW
         energy = np.nan_to_num(masked_gauss(taken * taken, ones, _WINDOW))
-        odd = (np.abs(away) > _NOISE_SIGMAS) | (energy > _MOST_ENERGY)
+        odd = (np.abs(away) > sigmas) | (energy > most)
         near = maximum_filter(odd.astype(np.uint8), size=2 * round(_WINDOW) + 1)
         return np.asarray(near.reshape(-1)[self.heights.cell] > 0)
 
-    def with_picture(self, q: FloatArray, shading: Shading, believed: BoolArray, albedo: FloatArray, spread: float) -> FloatArray:
+    def with_picture(
+        self, q: FloatArray, shading: Shading, believed: BoolArray, albedo: FloatArray, noise: FloatArray
+    ) -> FloatArray:
         """Gauss-Newton from `q` with the picture's residuals of the believed inner cells."""
         heights = self.heights
-        lift = shading.seen[believed]
-        # a lamp and an albedo are not known better than a few per cent
-        noise = np.hypot(spread, 0.01 * lift)
+        noise = noise[believed]
         for _ in range(_STEPS):
             normals, slope_u, slope_v = heights.normals(q)
             value, by_normal = shading.at(normals)
@@ -224,13 +247,16 @@ def _believed(
 
     weight = spread(lit.astype(float))
     apart = spread(np.where(lit, np.log(np.maximum(seen, 1e-9) / np.maximum(predicted, 1e-9)), 0.0))
+    # grain of paint, dark and bright, averages out, but most of its cells are off
+    speckled = masked_gauss((np.abs(apart) > _SPECK).astype(float), weight, _COARSE) > 0.5
+    apart = np.clip(apart, -_CLIPPED, _CLIPPED)
     coarse = masked_gauss(apart, weight, _COARSE)
     slow = coarse
     for _ in range(3):
         kept = weight * (np.abs(np.nan_to_num(coarse - slow)) < _PAINT)
         found = masked_gauss(apart, kept, _SLOW)
         slow = np.where(np.isfinite(found), found, 0.0)
-    odd = (weight > 0) & ~(np.abs(coarse - slow) < _PAINT)
+    odd = (weight > 0) & (~(np.abs(coarse - slow) < _PAINT) | speckled)
     odd = maximum_filter(odd.astype(np.uint8), size=2 * round(_COARSE) + 1) > 0
     painted = lit & odd.reshape(-1)[cell]
     albedo = np.exp(slow.reshape(-1)[cell])
