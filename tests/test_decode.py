@@ -189,6 +189,36 @@ def test_phase_pictures_refine_the_code(truth):
     )
 
 
+def test_a_missing_phase_picture_is_fitted_around_and_too_few_are_left_to_the_code(truth):
+    whole = [taken(v, "c", 0.3, seed=k) for k, v in enumerate((LEFT, RIGHT))]
+
+    def without(*steps):
+        fewer = []
+        for pictures in whole:
+            kept = [None if k in steps else p for k, p in enumerate(pictures.column_phase[0])]
+            fewer.append(replace(pictures, column_phase=(kept, pictures.column_phase[1])))
+        return decode_gray_code(fewer[0], LEFT, fewer[1], RIGHT)
+
+    all_four, three, two = without(), without(1), without(1, 2)
+    # three pictures know no second harmonic of the camera's response, which four let cancel: a few hundredths of a period
+    assert np.median(errors(three, truth)) < np.median(errors(all_four, truth)) + TENTH_PX_MM
+    coded = [replace(pictures, column_phase=None) for pictures in whole]
+    alone = decode_gray_code(coded[0], LEFT, coded[1], RIGHT)
+    assert np.array_equal(two.scan.range_mm, alone.scan.range_mm, equal_nan=True)
+    assert all_four.lost == ()
+    assert "phase picture 1 of 4 of the column is missing; the others are fitted" in three.lost[0]
+    assert "phase picture 1, 2 of 4 of the column is missing; too few are left" in two.lost[0]
+
+
+def test_the_finest_pictures_of_one_camera_may_be_missing(both, truth):
+    whole = decode_gray_code(both[0], LEFT, both[1], RIGHT)
+    coarse = replace(both[1], column=[*both[1].column[:-1], (None, None)])
+    found = decode_gray_code(both[0], LEFT, coarse, RIGHT)
+    assert any("both pictures of column bit 5 are missing" in said for said in found.lost)
+    assert np.median(errors(found, truth)) < np.median(errors(whole, truth)) + 2 * TENTH_PX_MM
+    assert found.scan.valid.sum() > 0.8 * whole.scan.valid.sum()
+
+
 @pytest.mark.parametrize(
     "spoil, message",
     [
@@ -259,10 +289,70 @@ def test_a_described_capture_is_read_and_decoded_alike(tmp_path, both):
         ({"left": document["left"] | {"pictures": [{"file": "../x.png"}]}}, "outside its own folder"),
         ({"left": document["left"] | {"pictures": document["left"]["pictures"][1:]}}, "lacks a white or a black"),
         ({"right": document["left"]}, "either right or projector"),
+        ({"cells": [64]}, "they are the projector's"),
     ):
         (tmp_path / "capture.json").write_text(json.dumps(document | spoil))
         with pytest.raises(InputError, match=message):
             read_capture(tmp_path)
+
+
+def test_listed_pictures_that_are_not_there_are_missing_and_not_an_end(tmp_path, both):
+    document = {"schema": "rangecheck/capture/1", "unit": "mm"}
+    for side, pictures, v in (("left", both[0], LEFT), ("right", both[1], RIGHT)):
+        (tmp_path / side).mkdir()
+        entry = described(tmp_path / side, pictures, v)
+        for one in entry["pictures"]:
+            one["file"] = f"{side}/{one['file']}"
+        document[side] = entry
+    lost = [p for p in document["right"]["pictures"] if p.get("axis") == "column" and p.get("bit") == 5]
+    for one in lost:
+        (tmp_path / one["file"]).unlink()
+    gone = replace(both[1], column=[*both[1].column[:-1], (None, None)])
+    wanted = decode_gray_code(both[0], LEFT, gone, RIGHT).scan.range_mm
+    (tmp_path / "capture.json").write_text(json.dumps(document))
+    capture = read_capture(tmp_path)
+    assert np.array_equal(decode_gray_code(*capture[:4]).scan.range_mm, wanted, equal_nan=True)
+    # not listed at all: the other camera says how many bits there are
+    document["right"]["pictures"] = [p for p in document["right"]["pictures"] if p not in lost]
+    (tmp_path / "capture.json").write_text(json.dumps(document))
+    assert np.array_equal(decode_gray_code(*read_capture(tmp_path)[:4]).scan.range_mm, wanted, equal_nan=True)
+    (tmp_path / document["left"]["pictures"][0]["file"]).unlink()
+    with pytest.raises(InputError, match="does not exist; left cannot be decoded without its white picture"):
+        read_capture(tmp_path)
+
+
+def test_the_projectors_size_says_how_many_bits_there_are(tmp_path, both, truth):
+    coarse = replace(both[0], column=both[0].column[:-1])
+    document = {"schema": "rangecheck/capture/1", "unit": "mm", "left": described(tmp_path, coarse, LEFT)}
+    document["projector"] = {"camera": PROJECTOR.camera.to_dict(), "world_from_camera": PROJECTOR.world_from_camera.tolist()}
+    (tmp_path / "capture.json").write_text(json.dumps(document))
+    capture = read_capture(tmp_path)
+    assert len(capture.left.column) == 6 and capture.left.column[5] == (None, None)
+    found = decode_gray_code(capture.left, capture.left_view, projector=capture.projector)
+    # read as if there were 5 bits, everything would lie at half its column, decimetres off
+    assert np.median(errors(found, truth)) < 2 * 500**2 / (100 * 140) / 30
+
+
+def test_the_last_numbered_pictures_of_one_camera_may_be_missing(tmp_path, both):
+    from PIL import Image
+
+    for side, pictures, v in (("leftCam", both[0], LEFT), ("rightCam", both[1], RIGHT)):
+        (tmp_path / side).mkdir()
+        shots = [pictures.white, pictures.black, *(p for pair in (*pictures.row, *pictures.column) for p in pair)]
+        for number, picture in enumerate(shots if side == "leftCam" else shots[:-4]):
+            Image.fromarray(picture).save(tmp_path / side / f"{number:04d}.png")
+        camera_from_world = inverse(v.world_from_camera)
+        numbers = {
+            "Matrix": v.camera.matrix, "Distortion": [*v.camera.distortion, 0, 0, 0][:5], "Translation": camera_from_world[:3, 3],
+            "Rotation": camera_from_world[:3, :3],
+        }  # fmt: skip
+        body = "".join(f"<{k}><data>{' '.join(repr(float(x)) for x in np.ravel(n))}</data></{k}>" for k, n in numbers.items())
+        size = f"<Width>{v.camera.width}</Width><Height>{v.camera.height}</Height>"
+        (tmp_path / side / "calib.xml").write_text(f"<opencv_storage><Camera>{body}{size}</Camera></opencv_storage>")
+    capture = read_capture(tmp_path)
+    assert len(capture.right.row) == len(capture.right.column) == BITS
+    assert capture.right.column[-2:] == [(None, None)] * 2 and capture.right.column[-3][0] is not None
+    assert np.array_equal(capture.right.row[0][0], both[1].row[0][0])
 
 
 def test_folders_without_pictures_are_named(tmp_path):

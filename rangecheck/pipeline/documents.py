@@ -309,7 +309,8 @@ def _documents() -> dict[str, tuple[Any, ...]]:
         ),
         "capture": (
             "capture.json: structured-light pictures and their calibration",
-            record(unit=one_of("mm", "cm", "m", "um", "in"), left=taken, right=maybe(taken), projector=maybe(record(view))),
+            record(unit=one_of("mm", "cm", "m", "um", "in"), left=taken, right=maybe(taken), projector=maybe(record(view)),
+                   cells=maybe(many(COUNT, 2))),
         ),
         "frames": (
             "The list of a turntable's finished frames, by which it is resumed",

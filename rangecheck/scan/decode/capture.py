@@ -4,7 +4,9 @@ Two layouts are read:
 - `capture.json`: {"schema": "rangecheck/capture/1", "unit": "mm", "left": CAMERA, "right": CAMERA} or with "projector": {"camera": {..},
   "world_from_camera": [[4x4]]} in place of right, where CAMERA = {"camera": {...}, "world_from_camera": [[4x4]], "pictures":
   [{"file": "a.png", "kind": "white"}, {"kind": "black"}, {"kind": "gray", "axis": "column", "bit": 0, "inverse": false},
-   {"kind": "phase", "axis": "column", "period": 16.0, "step": 0, "steps": 4}]}; bit 0 is the most significant;
+   {"kind": "phase", "axis": "column", "period": 16.0, "step": 0, "steps": 4}]}; bit 0 is the most significant. A picture that is listed and
+  not there, or not listed, is missing; how many bits there are is what the projector's size needs (or "cells": [columns, rows], where two
+  cameras stand alone), or else the last that either camera lists;
 - that of 3DUNDERWORLD-SLS: folders leftCam and rightCam with pictures numbered 0000 white, 0001 black, then the row bits and the column
   bits, most significant first, each followed by its inverse, and calib.xml (OpenCV: X_camera = R X_world + t, mm, and the size of
   the calibrated pictures, to which smaller ones are scaled).
@@ -14,6 +16,7 @@ from __future__ import annotations
 
 import re
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
@@ -51,9 +54,16 @@ def read_capture(folder: str | Path) -> Capture:
     if (folder / "capture.json").is_file():
         return _described(folder / "capture.json")
     if (folder / "leftCam").is_dir() and (folder / "rightCam").is_dir():
-        left, left_view = _numbered(folder / "leftCam")
-        right, right_view = _numbered(folder / "rightCam")
-        return Capture(left, left_view, right, right_view, None)
+        named = [_by_number(folder / name) for name in ("leftCam", "rightCam")]
+        # the last pictures of one camera, or of both, may be missing
+        bits = max(-(-(max(found) - 1) // 4) for found in named)
+        if not 2 <= bits <= 16:
+            raise InputError(
+                folder,
+                f"ends with picture {max(map(max, named)):04d}; that is {bits} bits for each axis, and 2 to 16 are decoded",
+            )
+        left, right = (_numbered(folder / name, found, bits) for name, found in zip(("leftCam", "rightCam"), named))
+        return Capture(*left, *right, None)
     if not folder.is_dir():
         raise InputError(folder, "is not a folder of structured-light pictures")
     below = sorted(p.parent.name for p in folder.glob("*/capture.json"))
@@ -85,20 +95,19 @@ def _read_all(paths: list[Path]) -> list[Picture]:
     return [p for some in in_chunks(lambda i, j: [read_grey(p) for p in paths[i:j]], len(paths), 1) for p in some]
 
 
-def _numbered(folder: Path) -> tuple[Pictures, View]:
+def _by_number(folder: Path) -> dict[int, Path]:
+    """Pictures by their numbers; of several files of one number the last, for decoded copies carry a suffix after the number."""
     by_number: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
         match = re.match(r"(\d{4})(?:\D.*)?\.(jpg|jpeg|png|bmp|pgm)$", path.name, re.IGNORECASE)
         if match:
-            # of several files of one number the last: decoded copies carry a suffix after the number
             by_number[int(match[1])] = path
     if not {0, 1} <= set(by_number):
         raise InputError(folder, "lacks picture 0000 (white) or 0001 (black); both are needed")
-    bits = -(-(max(by_number) + 1 - 2) // 4)  # the last pictures may be missing
-    if not 2 <= bits <= 16:
-        raise InputError(
-            folder, f"ends with picture {max(by_number):04d}; that is {bits} bits for each axis, and 2 to 16 are decoded"
-        )
+    return by_number
+
+
+def _numbered(folder: Path, by_number: dict[int, Path], bits: int) -> tuple[Pictures, View]:
     numbers = sorted(by_number)
     pictures = dict(zip(numbers, _read_all([by_number[n] for n in numbers])))
 
@@ -158,10 +167,26 @@ def _described(path: Path) -> Capture:
     scale = mm_per(document.get("unit", "")) if document.get("unit") in ("mm", "cm", "m", "um", "in") else 0.0
     if scale == 0.0:
         raise InputError(path, f"says its unit is {document.get('unit')!r}; it must be mm, cm, m, um or in")
+    cells = _cells(path, document)
     left = _camera(path, "left", document["left"], scale)
     if "projector" in document:
-        return Capture(*left, None, None, _view(path, "projector", document["projector"], scale))
-    return Capture(*left, *_camera(path, "right", document["right"], scale), None)
+        projector = _view(path, "projector", document["projector"], scale)
+        return Capture(
+            left.pictures(left.bits(cells or (projector.camera.width, projector.camera.height))), left.view, None, None, projector
+        )
+    right = _camera(path, "right", document["right"], scale)
+    least = left.bits(cells), right.bits(cells)
+    bits = {axis: max(n[axis] for n in least) for axis in ("column", "row")}
+    return Capture(left.pictures(bits), left.view, right.pictures(bits), right.view, None)
+
+
+def _cells(path: Path, document: dict[str, Any]) -> tuple[int, int] | None:
+    match document.get("cells"):
+        case None:
+            return None
+        case [int(columns), int(rows)] if 2 <= columns <= 65536 and 2 <= rows <= 65536:
+            return columns, rows
+    raise InputError(path, f"has cells {document['cells']!r:.60}; they are the projector's [columns, rows], 2 to 65536 each")
 
 
 def _view(path: Path, where: str, entry: Any, scale: float) -> View:
@@ -173,38 +198,71 @@ def _view(path: Path, where: str, entry: Any, scale: float) -> View:
         raise InputError(path, f"{where} has no usable camera and world_from_camera ({error})") from None
 
 
-def _camera(path: Path, where: str, entry: Any, scale: float) -> tuple[Pictures, View]:
+@dataclass(frozen=True)
+class _Taken:
+    """What one camera took, as far as it is there: white and black, (pattern, inverse) by bit, and phase pictures by step, with steps and
+    period, by axis."""
+
+    view: View
+    name: str
+    plain: dict[str, Picture]
+    found: dict[str, dict[int, list[Picture | None]]]
+    phases: dict[str, dict[int, Picture | None]]
+    steps: dict[str, tuple[int, float]]
+
+    def bits(self, cells: tuple[int, int] | None) -> dict[str, int]:
+        """How many bits each axis has: as many as this camera lists, and as many as `cells` need of an axis that is listed at all."""
+        counts = {}
+        for k, axis in enumerate(("column", "row")):
+            listed = max(self.found[axis], default=-1) + 1
+            counts[axis] = max(listed, (cells[k] - 1).bit_length()) if cells and listed else listed
+        return counts
+
+    def pictures(self, bits: dict[str, int]) -> Pictures:
+        """All of them, those that are missing as None."""
+        none: list[Picture | None] = [None, None]
+        pairs = {
+            axis: [(found.get(k, none)[0], found.get(k, none)[1]) for k in range(bits[axis])]
+            for axis, found in self.found.items()
+        }
+        shifted = {
+            axis: ([self.phases[axis].get(k) for k in range(count)], period) for axis, (count, period) in self.steps.items()
+        }
+        full = float(np.iinfo(self.plain["white"].dtype).max)
+        return Pictures(
+            self.plain["white"], self.plain["black"], pairs["column"], pairs["row"], shifted.get("column"), shifted.get("row"), full,
+            self.name,
+        )  # fmt: skip
+
+
+def _camera(path: Path, where: str, entry: Any, scale: float) -> _Taken:
     view = _view(path, where, entry, scale)
     listed = entry.get("pictures")
     if not isinstance(listed, list) or not all(isinstance(p, dict) and isinstance(p.get("file"), str) for p in listed):
         raise InputError(path, f"{where} needs a list `pictures` of objects with a file and a kind")
-    pictures = _read_all([beside(path, p["file"]) for p in listed])
-    plain: dict[str, Picture] = {}
-    bits: dict[str, dict[int, list[Picture | None]]] = {"column": {}, "row": {}}
-    phases: dict[str, dict[int, Picture]] = {"column": {}, "row": {}}
-    periods: dict[str, float] = {}
-    for described, picture in zip(listed, pictures):
+    files = [beside(path, p["file"]) for p in listed]
+    there = [file for file in files if file.exists()]
+    read = dict(zip(there, _read_all(there)))
+    taken = _Taken(view, where, {}, {"column": {}, "row": {}}, {"column": {}, "row": {}}, {})
+    for described, file in zip(listed, files):
+        picture = read.get(file)
         match described:
             case {"kind": "white" | "black" as kind}:
-                plain[kind] = picture
+                if picture is None:
+                    raise InputError(file, f"does not exist; {where} cannot be decoded without its {kind} picture")
+                taken.plain[kind] = picture
             case {"kind": "gray", "axis": "column" | "row" as axis, "bit": int(bit)} if 0 <= bit < 16:
-                bits[axis].setdefault(bit, [None, None])[bool(described.get("inverse", False))] = picture
-            case {"kind": "phase", "axis": "column" | "row" as axis, "step": int(step), "period": float() | int() as period}:
-                phases[axis][step] = picture
-                periods[axis] = float(period)
+                taken.found[axis].setdefault(bit, [None, None])[bool(described.get("inverse", False))] = picture
+            case {"kind": "phase", "axis": "column" | "row" as axis, "step": int(step), "period": float() | int() as period} if (
+                0 <= step < 64 and isinstance(count := described.get("steps"), int) and step < count <= 64
+            ):
+                taken.phases[axis][step] = picture
+                taken.steps[axis] = max(count, taken.steps.get(axis, (0, 0.0))[0]), float(period)
             case _:
                 raise InputError(
-                    path, f"{where} lists {described!r:.100}; kinds are white, black, gray (axis, bit, inverse) and phase"
+                    path,
+                    f"{where} lists {described!r:.100}; kinds are white, black, gray (axis, bit, inverse) and phase (axis, step, steps, period)",
                 )
-    if len(plain) != 2:
+    if len(taken.plain) != 2:
         raise InputError(path, f"{where} lacks a white or a black picture; both are needed")
-    pairs = {
-        axis: [(found.get(k, [None, None])[0], found.get(k, [None, None])[1]) for k in range(max(found, default=-1) + 1)]
-        for axis, found in bits.items()
-    }
-    shifted = {axis: ([found[k] for k in sorted(found)], periods[axis]) if found else None for axis, found in phases.items()}
-    full = float(np.iinfo(plain["white"].dtype).max)
-    return (
-        Pictures(plain["white"], plain["black"], pairs["column"], pairs["row"], shifted["column"], shifted["row"], full, where),
-        view,
-    )
+    return taken

@@ -24,6 +24,8 @@ from rangecheck.kernels import in_chunks
 from rangecheck.scan.decode.code import coordinates
 
 Picture = npt.NDArray[Any]
+#: pictures in order, None where missing, and the period in projector cells
+Phase = tuple[Sequence[Picture | None], float]
 #: pixels of the Gaussian that quiets sensor noise before crossings are looked for; it shifts none
 QUIET_PX = 0.7
 #: rounds of balancing: each leaves about a tenth of the offset before it
@@ -39,21 +41,22 @@ class Pictures:
 
     white, black      projector fully on and off
     column, row       Gray code, most significant bit first: (pattern, inverse), either or both None where missing; row may be empty
-    column_phase      phase-shift pictures in order, and their period in projector cells; row_phase likewise
+    column_phase      phase-shift pictures in order, None where missing, and their period in projector cells; row_phase likewise. Three that
+                      are there suffice; with fewer the Gray code stands alone
     full_scale        brightest value a pixel can have"""
 
     white: Picture = field(repr=False)
     black: Picture = field(repr=False)
     column: Sequence[tuple[Picture | None, Picture | None]] = field(repr=False)
     row: Sequence[tuple[Picture | None, Picture | None]] = field(default=(), repr=False)
-    column_phase: tuple[Sequence[Picture], float] | None = field(default=None, repr=False)
-    row_phase: tuple[Sequence[Picture], float] | None = field(default=None, repr=False)
+    column_phase: Phase | None = field(default=None, repr=False)
+    row_phase: Phase | None = field(default=None, repr=False)
     full_scale: float = 255.0
     name: str = "camera"
 
     def __post_init__(self) -> None:
         shape = self.white.shape
-        phases = [p for phase in (self.column_phase, self.row_phase) if phase for p in phase[0]]
+        phases = [p for phase in (self.column_phase, self.row_phase) if phase for p in phase[0] if p is not None]
         every = [self.white, self.black, *phases, *(p for pair in (*self.column, *self.row) for p in pair if p is not None)]
         if self.white.ndim != 2 or any(p.shape != shape for p in every):
             raise ScanError(
@@ -79,6 +82,11 @@ class Pictures:
                     said.append(
                         f"{self.name}: the {which} of {axis} bit {k} is missing; rebuilt from white, black and its partner"
                     )
+        for axis, phase in (("column", self.column_phase), ("row", self.row_phase)):
+            gone = [str(k) for k, picture in enumerate(phase[0]) if picture is None] if phase else []
+            if phase and gone:
+                rest = "the others are fitted" if _usable(phase) else "too few are left, and the Gray code stands alone"
+                said.append(f"{self.name}: phase picture {', '.join(gone)} of {len(phase[0])} of the {axis} is missing; {rest}")
         return said
 
 
@@ -131,7 +139,7 @@ def _lit(pictures: Pictures, min_contrast: float) -> tuple[FloatArray, FloatArra
 def _axis(
     pictures: Pictures,
     pairs: Sequence[tuple[Picture | None, Picture | None]],
-    phase: tuple[Sequence[Picture], float] | None,
+    phase: Phase | None,
     white: FloatArray,
     black: FloatArray,
     contrast: FloatArray,
@@ -179,8 +187,8 @@ def _axis(
     finest = next(k for k in range(n - 1, -1, -1) if not (missing >> (n - 1 - k)) & 1)
     swing = cv2.GaussianBlur(np.abs(differences[finest]), (0, 0), 3.0)
     faint = swing < 0.06 * np.maximum(contrast, 1e-3)
-    if phase is not None:
-        coordinate = _refined(coordinate, [turn(_quiet(p)) for p in phase[0]], phase[1])
+    if phase is not None and _usable(phase):
+        coordinate = _refined(coordinate, [None if p is None else turn(_quiet(p)) for p in phase[0]], phase[1])
     return turn(coordinate), turn(faint)
 
 
@@ -190,11 +198,18 @@ def _quiet(picture: Picture) -> FloatArray:
     return cv2.GaussianBlur(picture.astype(np.float32, copy=False), (0, 0), QUIET_PX)
 
 
-def _refined(coarse: FloatArray, steps: list[FloatArray], period: float) -> FloatArray:
-    """Coordinate from the phase of N pictures; the coarse one only says which period."""
-    angles = 2 * math.pi * np.arange(len(steps)) / len(steps)
-    sine = sum(np.float32(math.sin(a)) * p for a, p in zip(angles, steps))
-    cosine = sum(np.float32(math.cos(a)) * p for a, p in zip(angles, steps))
+def _usable(phase: Phase) -> bool:
+    """Whether brightness, contrast and phase can be told: three unknowns."""
+    return sum(picture is not None for picture in phase[0]) >= 3
+
+
+def _refined(coarse: FloatArray, steps: Sequence[FloatArray | None], period: float) -> FloatArray:
+    """Coordinate from the phase of those of N pictures that are there, by least squares; the coarse one only says which period."""
+    known = [(2 * math.pi * n / len(steps), picture) for n, picture in enumerate(steps) if picture is not None]
+    design = np.array([[1.0, math.cos(angle), math.sin(angle)] for angle, _ in known])
+    _, cosines, sines = np.linalg.pinv(design)
+    cosine = sum(np.float32(weight) * picture for weight, (_, picture) in zip(cosines, known))
+    sine = sum(np.float32(weight) * picture for weight, (_, picture) in zip(sines, known))
     turns = np.arctan2(sine, cosine) / np.float32(2 * math.pi)
     return (np.float32(period) * (turns + np.rint(coarse / np.float32(period) - turns))).astype(np.float32)
 
