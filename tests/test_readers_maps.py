@@ -84,6 +84,17 @@ def test_a_cyberware_stage_measures_heights(tmp_path):
     assert np.allclose(scan.points_mm()[:, 2], -np.array([-0.8, 4, 4.8, 0.8, 1.6, 2.4]), atol=1e-5)
 
 
+@pytest.mark.parametrize("count", ["124³", "9" * 5000, "-3", "0x10", "1_0"])
+def test_a_count_that_is_no_whole_number_is_refused(tmp_path, count):
+    (tmp_path / "a.cyb").write_bytes(cyberware(np.full((4, 512), 10000)).replace(b"NLT=4", f"NLT=--{count}".encode("latin-1")))
+    with pytest.raises(InputError, match="a whole number is needed"):
+        read_scans(tmp_path / "a.cyb")
+    head = f"ply\nformat ascii 1.0\nelement vertex {count}\nproperty float x\nproperty float y\nproperty float z\nend_header\n1 2 3\n"
+    (tmp_path / "a.ply").write_bytes(head.encode("latin-1"))
+    with pytest.raises(InputError, match="line 3 of its header"):
+        read_measured(tmp_path / "a.ply", "mm")
+
+
 @pytest.mark.parametrize(
     "change, message",
     [

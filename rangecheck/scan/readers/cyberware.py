@@ -78,6 +78,6 @@ def read_cyberware(path: Path, unit: str | None = None) -> list[RangeScan]:
 
 def _whole(path: Path, head: dict[str, str], key: str) -> int:
     text = head.get(key, "")
-    if not text.lstrip("-").isdecimal() or len(text) > 9:
+    if not text.removeprefix("-").isdecimal() or len(text) > 9:
         raise InputError(path, f"its header has {key}={text[:20]!r}; a whole number is needed", key=key)
     return int(text)

@@ -85,7 +85,9 @@ def announced(path: Path) -> dict[str, int]:
     if not head.startswith(MAGIC) or end < 0:
         return {}
     lines = [line.split() for line in head[:end].decode("latin-1").splitlines()]
-    return {words[1]: int(words[2]) for words in lines if len(words) == 3 and words[0] == "element" and words[2].isdecimal()}
+    return {
+        words[1]: int(words[2][:18]) for words in lines if len(words) == 3 and words[0] == "element" and words[2][:18].isdecimal()
+    }
 
 
 def read_ply(path: Path) -> Ply:
@@ -121,7 +123,7 @@ def _header(path: Path, content: bytes) -> tuple[str, Ply, int]:
                 case ["comment" | "obj_info", *rest]:
                     if rest:
                         info[rest[0]] = " ".join(rest[1:])
-                case ["element", name, rows] if rows.isdigit() and name not in elements:
+                case ["element", name, rows] if rows.isdecimal() and len(rows) < 19 and name not in elements:
                     elements[name] = Element(name, int(rows))
                 case ["property", "list", length, item, name] if _TYPES[length][0] in "iu":
                     list(elements.values())[-1].properties.append(Property(name, _TYPES[item], _TYPES[length]))
