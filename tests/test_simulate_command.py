@@ -135,3 +135,24 @@ def test_the_noise_that_is_stated_is_the_noise_that_was_drawn(meshes, tmp_path, 
         scan, truth = read_scans(tmp_path / options[1])[0], np.load(tmp_path / options[1] / "truth" / "view_00.npz")
         head_on = (truth["noise_mm"] * np.abs(truth["true_normal"] @ scan.world_from_scan[:3, 2]))[scan.valid]
         assert scan.noise_mm == pytest.approx(np.nanmedian(head_on), rel=0.2)
+
+
+def test_decoding_says_why_pixels_are_empty_and_how_far_another_programs_points_lie(meshes, tmp_path, capsys):
+    simulated(
+        capsys, meshes / "small.ply", tmp_path / "out", "--kind", "gray-code", "--pictures", "--views", "1", "--size", "160x120"
+    )
+    line = ["decode", str(tmp_path / "out" / "view_00"), "-q", "--json", "-o", str(tmp_path / "scans" / "a.npz")]
+    assert exit_status([*line, "--pictures"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    (scan,) = read_scans(tmp_path / "scans")  # what is drawn beside them keeps no folder of scans from being read
+    why = np.load(tmp_path / "scans" / "a_pictures" / "reasons.npz")
+    assert np.array_equal(why["reason"] == 0, scan.valid) and told["against"] is None
+    assert all((why["reason"] == k).sum() == told["counts"][name] for k, name in enumerate(why["names"].tolist()))
+    # the same points, moved by 1 mm along x and written by somebody else
+    cloud = "".join(f"v {x + 1} {y} {z}\n" for x, y, z in scan.points_mm().tolist())
+    (tmp_path / "cloud.obj").write_text("# theirs\n" + cloud)
+    assert exit_status([*line, "--force", "--against", str(tmp_path / "cloud.obj"), "--unit", "mm"]) == 0
+    compared = json.loads(capsys.readouterr().out)["against"]
+    assert compared["points"] == scan.valid.sum() and 0.2 < compared["median_mm"] <= compared["p90_mm"] <= 1.0 + 1e-6
+    fewer = [*line, "--force", "--min-contrast", "0.5"]
+    assert exit_status(fewer) == 0 and json.loads(capsys.readouterr().out)["valid"] < told["valid"]

@@ -258,7 +258,8 @@ def _documents() -> dict[str, tuple[Any, ...]]:
         "decode": (
             "`decode`",
             record(output=TEXT, valid=COUNT, measured=COUNT, counts=by_name(COUNT), lost=TEXTS, inputs=NAMES, seconds=NUMBERS,
-                   reprojection_px=record(median=NUMBER, p90=NUMBER)),
+                   reprojection_px=record(median=NUMBER, p90=NUMBER),
+                   against=or_null(record(points=COUNT, compared=COUNT, median_mm=NUMBER, p90_mm=NUMBER))),
         ),
         "dataset": (
             "`dataset`, its dataset.json, and its masks.json, a COCO annotation file",

@@ -55,8 +55,8 @@ def holds_scans(path: Path) -> bool:
     return "range_grid" in elements or "camera" in elements or (bool(elements) and not {"face", "tristrips"} & set(elements))
 
 
-def decoded(folder: str | Path, reporter: Reporter) -> DecodedScan:
-    """The range scan of the structured-light pictures in `folder`."""
+def decoded(folder: str | Path, reporter: Reporter, **limits: float) -> DecodedScan:
+    """The range scan of the structured-light pictures in `folder`; `limits` are those of `decode_gray_code`."""
     from rangecheck.scan.decode import decode_gray_code, read_capture
 
     with reporter.stage("reading pictures"):
@@ -69,6 +69,7 @@ def decoded(folder: str | Path, reporter: Reporter) -> DecodedScan:
             capture.right_view,
             projector=capture.projector,
             name=Path(folder).resolve().name,
+            **limits,
         )
     for what in found.lost:
         reporter.note(f"lost: {what}")

@@ -72,6 +72,7 @@ FORMATS = (
     Format("E57", (".e57",), (e57.MAGIC,), e57.read_e57),
     Format("Cyberware echo", (".cyb", ".cy", ".echo"), (cyberware.MAGIC,), cyberware.read_cyberware),
     Format("list of points", (".xyz",), (), xyz.read_xyz),
+    Format("OBJ", (".obj",), (), xyz.read_obj, in_folders=False),
     Format("list of points", (".txt", ".asc", ".csv"), (), xyz.read_xyz, in_folders=False),
 )
 

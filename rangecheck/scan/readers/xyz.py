@@ -1,4 +1,4 @@
-"""Plain lists of points: `.xyz`, `.txt`, `.asc`, `.csv`, and PLY files with vertices alone.
+"""Plain lists of points: `.xyz`, `.txt`, `.asc`, `.csv`, and PLY and OBJ files with vertices alone.
 
 Columns x y z; three more are taken as normals when all have length 1 (to 1 %), anything else after z is passed over. Lines that start
 with # or //, and one line of column names before the numbers, are passed over. A file of triangles is a mesh, not a measurement.
@@ -33,6 +33,25 @@ def read_xyz(path: Path, unit: str | None = None) -> list[PointCloud]:
         raise InputError(path, f"its first line of numbers is {first[:40]!r}; a point needs x y z")
     numbers, _ = parse_numbers(path, content, start, columns=width)
     return [_cloud(path, numbers.reshape(-1, width), unit)]
+
+
+def read_obj(path: Path, unit: str | None = None) -> list[PointCloud]:
+    """The vertices `v x y z` of an OBJ file without faces. Raises InputError for a mesh, UnitMissing without a unit."""
+    if unit is None:
+        raise UnitMissing(path)
+    lines = plain_text(read_bytes(path)).splitlines()
+    if any(line.startswith((b"f ", b"f\t")) for line in lines):
+        raise InputError(
+            path, "is a mesh without a camera, not a range scan; check it as a mesh, or export the scanner's own files"
+        )
+    points = [line[2:] for line in lines if line.startswith((b"v ", b"v\t"))]
+    if not points:
+        raise InputError(path, "holds no vertex; a cloud in OBJ holds lines `v x y z`")
+    width = len(points[0].split())
+    if width < 3:
+        raise InputError(path, f"its first vertex is {points[0][:40]!r}; a point needs x y z")
+    numbers, _ = parse_numbers(path, b"\n".join(points), columns=width)
+    return [_cloud(path, numbers.reshape(-1, width)[:, :3], unit)]
 
 
 def read_ply_cloud(ply: Ply, unit: str) -> list[PointCloud]:
