@@ -122,6 +122,11 @@ _OPTIONS: dict[str, Callable[..., Any]] = {
     "refine": click.option(
         "--refine", is_flag=True, help="Refine heights, within their noise, by the shading of linear brightness."
     ),
+    "memory": click.option(
+        "--memory-mb",
+        type=click.FloatRange(256),
+        help="Most memory to take, with all that is started, as of the setting memory_mb; what needs more ends and says so.",
+    ),
     "json": click.option("--json", "as_json", is_flag=True, help="Print one JSON document on stdout and nothing else."),
     "log": click.option(
         "--log", type=click.Path(dir_okay=False), metavar="FILE", help="Append what is done, with the time, to FILE."
@@ -140,13 +145,16 @@ def _percent(text: str | None) -> float | None:
 
 
 def common(*names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Add the named options, and always --json, --threads, -v and -q."""
+    """Add the named options, and always --json, --threads, --memory-mb, --log, -v and -q."""
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(function)
         def command(
-            *args: Any, verbose: int, quiet: bool, threads: int | None, as_json: bool, log: str | None, **kwargs: Any
-        ) -> int:
+            *args: Any, verbose: int, quiet: bool, threads: int | None, memory_mb: float | None, as_json: bool, log: str | None,
+            **kwargs: Any,
+        ) -> int:  # fmt: skip
+            if memory_mb:
+                click.get_current_context().call_on_close(bound_memory(memory_mb))
             if threads:
                 from rangecheck import kernels
 
@@ -166,7 +174,7 @@ def common(*names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
 
         command = click.option("-q", "--quiet", is_flag=True, help="No progress, no notes.")(command)
         command = click.option("-v", "--verbose", count=True, help="More about what is done.")(command)
-        for name in reversed(("json", "threads", "log")):
+        for name in reversed(("json", "threads", "memory", "log")):
             command = _OPTIONS[name](command)
         for name in reversed(names):
             command = _OPTIONS[name](command)
@@ -328,9 +336,10 @@ def settings_from(config: str | None, assignments: tuple[str, ...], preset: str 
     from rangecheck.config import load_settings
 
     settings = load_settings(config, assignments, {key.replace("__", "."): value for key, value in overrides.items()}, preset)
-    if settings.memory_mb is not None:
+    given = click.get_current_context().params
+    if settings.memory_mb is not None and not given.get("memory_mb"):
         click.get_current_context().call_on_close(bound_memory(settings.memory_mb))
-    if settings.threads and not click.get_current_context().params.get("threads"):
+    if settings.threads and not given.get("threads"):
         from rangecheck import kernels
 
         kernels.set_threads(settings.threads)

@@ -174,9 +174,11 @@ def test_a_killed_job_leaves_whole_files_and_ends_with_the_same_bytes(small_job,
     """Many more kills: `rangecheck study hardness --part kills-1`."""
     _, scans, undisturbed, command = small_job
     line = ["run", str(scans), "--out", str(tmp_path / "out"), *SMALL]
-    for operation in (150, 300):
-        assert command.run(line, Moment(operation=operation)).status == -signal.SIGKILL
-        assert faults(tmp_path / "out", undisturbed) == []
+    # how many threads and how much memory it takes do not make it another job
+    for operation, means in ((150, ()), (300, ("--set", "threads=1", "--set", "memory_mb=8000"))):
+        assert command.run([*line, *means], Moment(operation=operation)).status == -signal.SIGKILL
+        # which settings.json then tells
+        assert faults(tmp_path / "out", undisturbed) == (["settings.json"] if means else [])
     command.run(line)
     assert whole_files(tmp_path / "out") == undisturbed and left_over(tmp_path / "out") == []
 

@@ -95,11 +95,12 @@ def test_our_own_ply_says_its_unit_and_keeps_its_labels(tmp_path):
     box = cube(2.0)
     origin, part = (np.arange(12) % 3).astype(np.uint8), (np.arange(12) % 2).astype(np.int32)
     error = np.linspace(0.1, 0.8, 8)
-    write_mesh(Surface(box.vertices, box.faces, part, origin, ('a "first"', "base"), error), tmp_path / "box.ply")
+    write_mesh(Surface(box.vertices, box.faces, part, origin, ('a "first"', "base"), error, part == 1), tmp_path / "box.ply")
     found = open_mesh(tmp_path / "box.ply")
     assert found.unit == "mm" and found.surface.part_names == ('a "first"', "base")
     np.testing.assert_array_equal(found.surface.origin_of_face, origin)
     np.testing.assert_array_equal(found.surface.part_of_face, part)
+    np.testing.assert_array_equal(found.surface.refined_of_face, part == 1)
     np.testing.assert_allclose(found.surface.vertex_error_mm, error, rtol=1e-6)
     # a unit that is asked for goes first; labels that contradict their legend are none
     assert open_mesh(tmp_path / "box.ply", "cm").surface.volume_mm3 == pytest.approx(8000)

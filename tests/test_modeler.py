@@ -286,3 +286,17 @@ def test_the_shipped_scene_builds_proves_itself_and_shows_interreflection():
     # a plane face never mirrors itself
     planes = {name for name, true in zip(model.surface.part_names, model.true_faces) if true.kind == "plane"}
     assert not any(a == b and a in planes for a, b in pairs)
+
+
+def test_a_picture_of_a_scene_is_as_large_as_asked_and_shows_what_its_own_camera_shows():
+    from rangecheck.config import load_settings
+    from rangecheck.pipeline.subject import Subject
+    from rangecheck.pipeline.views import view_of
+
+    model = read_model(presets_folder() / "scenes" / "bored_block.toml")
+    subject = Subject("block", model.surface, model=model)
+    own, pose = view_of(subject, load_settings(), None)
+    assert own == model.camera and np.array_equal(pose, model.world_from_camera)
+    asked, same = view_of(subject, load_settings(None, ["picture.width=96", "picture.height=72"]), None)
+    assert (asked.width, asked.height) == (96, 72) and np.array_equal(same, pose)
+    assert asked.width / asked.fx == pytest.approx(own.width / own.fx)

@@ -13,7 +13,7 @@ from rangecheck.reflectance import GREY_UM, Material
 from rangecheck.scene import Scene, Source, constant, gradient
 from rangecheck.surface import Surface
 from rangecheck.surface.surface import join
-from rangecheck.transport import DIRECT, Plan, Settings, Tracer, image_irradiance, render
+from rangecheck.transport import DIRECT, Plan, Settings, Tracer, Tracers, image_irradiance, render
 from rangecheck.transport.camera_rays import pixel_order
 
 WHITE = Material("white", K_lm=0.8, wavelengths_um=GREY_UM)
@@ -242,6 +242,20 @@ def test_the_same_picture_has_the_same_bytes_on_one_thread_and_on_two_and_anothe
         assert film.variance.tobytes() == films[0].variance.tobytes()
         assert film.budget.tobytes() == films[0].budget.tobytes()
     assert Tracer(scene).render(camera, pose, settings, seed=8).radiance.tobytes() != films[0].radiance.tobytes()
+
+
+def test_tracers_of_one_surface_share_its_tree_and_make_the_pictures_of_their_own(monkeypatch):
+    one = Scene(ball(), (WHITE,), sources=(lamp((150, 150, 200), 40.0),), smooth=True)
+    other = replace(one, materials=(SATIN,), sources=(), surroundings=gradient(0.1, 0.9))
+    camera, pose = looking()
+    alone = [Tracer(scene).render(camera, pose).radiance for scene in (one, other)]
+    built = []
+    monkeypatch.setattr("rangecheck.transport.tracers.Tracer", lambda scene: built.append(scene) or Tracer(scene))
+    tracers = Tracers()
+    assert [tracers.of(s).render(camera, pose).radiance.tobytes() for s in (one, other)] == [a.tobytes() for a in alone]
+    flat = replace(one, smooth=False)
+    assert tracers.of(flat).render(camera, pose).radiance.tobytes() == Tracer(flat).render(camera, pose).radiance.tobytes()
+    assert built == [one, flat]
 
 
 def test_a_scene_far_from_the_origin_gives_the_same_picture():

@@ -42,6 +42,7 @@ from rangecheck.scan import RangeScan
 from rangecheck.scan.readers.limits import plain_name
 from rangecheck.solid import Finding, Verdict, finding, verdict
 from rangecheck.surface import INVENTED, ORIGIN_NAMES, Surface
+from rangecheck.transport import Tracers
 
 FINISHED = "run.json"
 #: the job's stripes are looked at view by view: a third of the turntable's frames, but not fewer than these
@@ -97,6 +98,7 @@ def _made(
     # a material may be a file anywhere; its turntable is called as the file is
     taken = {"stripes"}
     labels = {name: plain_name(Path(name).stem, taken) for name in settings.light.materials}
+    tracers = Tracers()
     turntables = [
         replace(
             render_turntable(
@@ -109,12 +111,14 @@ def _made(
                 reporter,
                 force=force,
                 scheduler=scheduler,
+                tracers=tracers,
             ),
             material=label,
         )
         for name, label in labels.items()
     ]
-    turntables += _stripes(subject, orbit, folder, settings, reporter, force=force, scheduler=scheduler)
+    turntables += _stripes(subject, orbit, folder, settings, reporter, tracers, force=force, scheduler=scheduler)
+    del tracers
     consistency = _consistency(shown, ready.grids, orbit, turntables, folder, settings, reporter, known)
     stl: dict[str, Any] | None = None
     (folder / "bust.stl").unlink(missing_ok=True)
@@ -213,8 +217,9 @@ def _front_deg(shown: Surface, eye_mm: FloatArray | None, reporter: Reporter) ->
 
 
 def _stripes(
-    subject: Subject, orbit: Orbit, folder: Path, settings: Settings, reporter: Reporter, *, force: bool, scheduler: str | None
-) -> list[Rendered]:
+    subject: Subject, orbit: Orbit, folder: Path, settings: Settings, reporter: Reporter, tracers: Tracers, *, force: bool,
+    scheduler: str | None,
+) -> list[Rendered]:  # fmt: skip
     """Where a material of the pictures mirrors, also what it makes of bands of light: they bend where its slope does."""
     mirror = next((name for name in settings.light.materials if load_material(name).strengths()[1:].any()), None)
     if mirror is None or settings.turntable.show != "picture":
@@ -224,7 +229,16 @@ def _stripes(
     frames = folder / "frames" / "stripes"
     fewer = replace(orbit, frames=max(min(orbit.frames, LEAST_STRIPES), orbit.frames // 3))
     made = render_turntable(
-        subject, mirror, fewer, folder / "stripes.mp4", frames, striped, reporter, force=force, scheduler=scheduler
+        subject,
+        mirror,
+        fewer,
+        folder / "stripes.mp4",
+        frames,
+        striped,
+        reporter,
+        force=force,
+        scheduler=scheduler,
+        tracers=tracers,
     )
     return [replace(made, material="stripes")]
 

@@ -39,7 +39,7 @@ from rangecheck.raycast import EmbreeCaster
 from rangecheck.reflectance import Material, load_material
 from rangecheck.scene import Scene
 from rangecheck.surface import Surface
-from rangecheck.transport import Plan, Tracer
+from rangecheck.transport import Plan, Tracer, Tracers
 
 Show = Literal["picture", "stripes", "distance", "id"]
 
@@ -178,12 +178,14 @@ def render_turntable(
     *,
     force: bool,
     scheduler: str | None = None,
+    tracers: Tracers | None = None,
 ) -> Rendered:
-    """Frames of the orbit in one material, and their film. Frames that are there already are kept."""
-    made = _planned(surface, material_name, lambda: orbit, frames_dir, settings, reporter)
+    """Frames of the orbit in one material, and their film. Frames that are there already are kept. Several turntables of one surface
+    share `tracers`."""
+    made = _planned(surface, material_name, lambda: orbit, frames_dir, settings, reporter, tracers)
     with Filming(film, settings.turntable.fps, orbit.frames, made.picture) as filming:
         _make(made, reporter, force, scheduler, filming.stands)
-        with reporter.stage(f"film, {made.name}"):
+        with reporter.stage(f"film, {made.called}"):
             filming.finish()
     return Rendered(made.name, made.frames, film, made.plan, any(_mirrors(m) for m in made.job.scene.materials))
 
@@ -197,6 +199,11 @@ class _Made:
     frames: list[Path]
     plan: list[str]
     tracer: Tracer | None = dataclasses.field(repr=False)
+
+    @property
+    def called(self) -> str:
+        """What is being made, for whoever waits for it."""
+        return "stripes" if self.job.show == "stripes" else self.name
 
     def picture(self, index: int) -> npt.NDArray[Any]:
         """A finished frame as people are shown it."""
@@ -225,14 +232,15 @@ def _planned(
     folder: Path,
     settings: Settings,
     reporter: Reporter,
+    tracers: Tracers | None = None,
 ) -> _Made:
     """Frames that are yet to be made, and how their light is followed. What needs no orbit is done before it is waited for."""
     known = subject if isinstance(subject, Subject) else Subject(material_name, subject)
     material, show = load_material(material_name), settings.turntable.show
     scene = scene_of(known, material, direct=settings.light.model == "direct", stripes=show == "stripes")
     lit = show in ("picture", "stripes")
-    with reporter.stage(f"planning light, {material.name}" if lit else "framing"):
-        tracer = Tracer(scene) if lit else None
+    with reporter.stage(f"planning light, {'stripes' if show == 'stripes' else material.name}" if lit else "framing"):
+        tracer = (tracers or Tracers()).of(scene) if lit else None
         orbit = orbit_when_found()
         optics = optics_of(settings, camera_of(settings), orbit.distance_mm)
         if optics.sensor is not None and optics.sensor.bits > 8:
@@ -277,7 +285,7 @@ def _make(
             stands=stands,
         )
 
-    with reporter.stage(f"turntable, {made.name}", job.orbit.frames):
+    with reporter.stage(f"turntable, {made.called}", job.orbit.frames):
         if scheduler is None:
             frames(frames_of(job, made.tracer))
         else:
@@ -339,6 +347,7 @@ def turntable(
     subject = read_subject(path, settings, unit, reporter)
     folder = Path(frames_dir) if frames_dir else film.with_name(f"{film.stem}-frames")
     made: list[_Made] = []
+    tracers = Tracers()
     with ThreadPoolExecutor(1) as aside:
         framing = aside.submit(orbit_of, subject.surface, settings)
         for name in chosen:
@@ -346,7 +355,7 @@ def turntable(
                 _make(made[-1], reporter, force, scheduler)
                 made[-1] = dataclasses.replace(made[-1], tracer=None)
             where = folder if len(chosen) == 1 else folder / Path(name).stem
-            made.append(_planned(subject, name, framing.result, where, settings, reporter))
+            made.append(_planned(subject, name, framing.result, where, settings, reporter, tracers))
     orbit = framing.result()
     with Filming(film, settings.turntable.fps, orbit.frames, partial(_beside_each_other, made)) as filming:
         _make(made[-1], reporter, force, scheduler, filming.stands)

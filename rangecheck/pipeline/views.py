@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from rangecheck.maps import (
     trace_maps,
     trace_shadows,
 )
-from rangecheck.optics import Camera, CylindricalCamera, OrthographicCamera
+from rangecheck.optics import Camera, CylindricalCamera, OrthographicCamera, PinholeCamera
 from rangecheck.pipeline.camera import camera_of, lensless
 from rangecheck.pipeline.folder import check_free, check_writable
 from rangecheck.pipeline.outcome import Outcome, document
@@ -49,20 +50,31 @@ def orbit_of(surface: Surface, settings: Settings) -> Orbit:
 
 def view_of(subject: Subject, settings: Settings, camera_mm: tuple[float, ...] | None) -> tuple[Camera, FloatArray]:
     """The camera and its pose: at `camera_mm` looking at the middle of the object; else as a modelled scene's own file says; else
-    the first view of the orbit of a pinhole. Raises SceneError when that is inside the object."""
+    the first view of the orbit of a pinhole. Raises SceneError when that is inside the object.
+
+    A size that was asked for goes over that of a scene's file, whose camera keeps its field of view."""
     kind, surface, model = settings.picture.camera, subject.surface, subject.model
     pinhole = settings.model_copy(update={"picture": settings.picture.model_copy(update={"camera": "pinhole"})})
     camera: Camera = camera_of(pinhole)
     if camera_mm is not None:
         pose = look_at(camera_mm, surface.bounds_mm.mean(axis=0))
     elif model is not None and model.camera is not None and model.world_from_camera is not None:
-        camera, pose = model.camera, model.world_from_camera
+        camera, pose = _as_large_as_asked(model.camera, settings), model.world_from_camera
     else:
         pose = orbit_of(surface, pinhole).world_from_camera(0)
     if kind != "pinhole":
         camera, pose = lensless(settings, surface, pose)
     require_outside(surface, camera, pose)
     return camera, pose
+
+
+def _as_large_as_asked(camera: PinholeCamera, settings: Settings) -> PinholeCamera:
+    """A scene's own camera, with pixels of the settings where they were set."""
+    picture = settings.picture
+    if not picture.model_fields_set & {"width", "height"}:
+        return camera
+    across = 2 * math.degrees(math.atan(camera.width / (2 * camera.fx)))
+    return PinholeCamera.from_field_of_view(picture.width, picture.height, across)
 
 
 def seen_by(camera: Camera) -> str:

@@ -106,7 +106,7 @@ def open_mesh(path: str | Path, unit: str | None = None) -> MeshFile:
         surface = Surface(in_mm, faces, part_names=(path.stem,))
     else:
         error = None if labels.error_mm is None else labels.error_mm * mm_per(unit)
-        surface = Surface(in_mm, faces, labels.part, labels.origin, labels.names, error)
+        surface = Surface(in_mm, faces, labels.part, labels.origin, labels.names, error, labels.refined)
     return MeshFile(surface, kind, unit, tuple(notes), own, records)
 
 

@@ -1,7 +1,7 @@
 """Reading PLY meshes: ASCII, binary of both byte orders, polygons of any size, properties in any order.
 
 Turk, *The PLY polygon file format*, 1994. Only `vertex` x y z and `face` vertex_indices (or vertex_index) are used, and what rangecheck's own
-PLY says in comments and properties: the unit, the part and the origin of each face, the error of each vertex; other elements and properties
+PLY says in comments and properties: the unit, the part and the origin of each face and whether a picture refined it, the error of each vertex; other elements and properties
 are stepped over. Nothing is allocated that the file's size does not warrant.
 """
 
@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from rangecheck.arrays import MM_PER_UNIT, FloatArray, IntArray
+from rangecheck.arrays import MM_PER_UNIT, BoolArray, FloatArray, IntArray
 from rangecheck.errors import InputError
 from rangecheck.surface.surface import ORIGIN_NAMES
 
@@ -48,12 +48,14 @@ class _Polygons:
 
 
 class Labels(NamedTuple):
-    """What a PLY of rangecheck says of its faces, part (m,) with their names and origin (m,), and of its vertices: error_mm (n,) or None."""
+    """What a PLY of rangecheck says of its faces, part (m,) with their names, origin (m,) and refined (m,) or None, and of its vertices:
+    error_mm (n,) or None."""
 
     part: IntArray
     names: tuple[str, ...]
     origin: IntArray
     error_mm: FloatArray | None
+    refined: BoolArray | None
 
 
 class PlyMesh(NamedTuple):
@@ -122,8 +124,16 @@ def _labels(comments: list[str], of_vertex: dict[str, Any], of_face: dict[str, A
     part, origin = np.asarray(of_face["part"]), np.asarray(of_face["origin"])
     if len(part) and not (part.min() >= 0 and part.max() < len(names) and origin.min() >= 0 and origin.max() < len(ORIGIN_NAMES)):
         return None
-    error = of_vertex.get("error_mm")
-    return Labels(part.astype(np.int32), names, origin.astype(np.uint8), None if error is None else np.asarray(error, np.float64))
+    error, refined = of_vertex.get("error_mm"), of_face.get("refined")
+    if refined is not None and not np.isin(refined, (0, 1)).all():
+        return None
+    return Labels(
+        part.astype(np.int32),
+        names,
+        origin.astype(np.uint8),
+        None if error is None else np.asarray(error, np.float64),
+        None if refined is None else np.asarray(refined, np.bool_),
+    )
 
 
 def _header(path: Path, content: bytes) -> tuple[str, list[_Element], memoryview, list[str]]:

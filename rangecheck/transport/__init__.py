@@ -5,6 +5,7 @@ from rangecheck.transport.film import Film, image_irradiance
 from rangecheck.transport.plan import MODELS, TOLERANCE, make_plan, render
 from rangecheck.transport.settings import DIRECT, REPORT, Plan, Settings
 from rangecheck.transport.tracer import Tracer
+from rangecheck.transport.tracers import Tracers
 
 __all__ = [
     "DIRECT",
@@ -15,6 +16,7 @@ __all__ = [
     "Plan",
     "Settings",
     "Tracer",
+    "Tracers",
     "image_irradiance",
     "make_plan",
     "render",
