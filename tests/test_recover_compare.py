@@ -97,6 +97,13 @@ def test_a_spot_of_paint_is_no_fault_of_the_shape(clean):
     assert named.regions and {r.kind for r in named.regions} == {"albedo"}
 
 
+@pytest.mark.parametrize("kind", ["registration", "shadow edge", "highlight"])
+def test_what_is_wrong_alone_is_named_as_what_it_is_where_it_is(kind):
+    from rangecheck.studies.fit_classes import named
+
+    assert named(kind, 3) == (kind, [])
+
+
 def test_on_strong_paint_nothing_is_judged_and_nothing_named():
     found = compare(ball_scan(paint=0.5), scale_mm=2.5)
     assert found.judged == 0.0 and found.regions == ()

@@ -251,7 +251,7 @@ def _classed(
     from scipy.ndimage import binary_dilation, maximum_filter
 
     glossy = _glossy(fitted, shading, cell, predicted, grid)
-    near = binary_dilation(shadow, iterations=max(1, round(0.5 * least_mm / grid.spacing_mm)))
+    near, in_reach = (binary_dilation(shadow, iterations=max(1, round(r * least_mm / grid.spacing_mm))) for r in (0.5, 2.5))
     # a spot's rim looks like relief: its middle tells that it is paint
     stained = maximum_filter(np.abs(paint), size=2 * round(2.0 * least_mm / grid.spacing_mm) + 1)
     found = []
@@ -262,10 +262,11 @@ def _classed(
         elif glossy[cells].mean() > 0.5:
             kind = "highlight"
         elif stained[at] > abs(region.z):
-            kind = "albedo"
+            # what is darker beside a shadow is its penumbra
+            kind = "shadow edge" if in_reach[at] else "albedo"
         else:
-            # a step is a line of places that steps explain best
-            kind = "registration" if stepped[at] and stepped[cells].mean() > 0.5 and region.kind == "registration" else "shape"
+            # a step is where steps explain most places best
+            kind = "registration" if stepped[at] and stepped[cells].mean() > 0.5 else "shape"
         found.append(replace(region, kind=kind))
     # what is weaker within a filter's reach of a fault is its side lobe
     kept: list[Region] = []

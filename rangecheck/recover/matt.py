@@ -29,7 +29,7 @@ _OUTLYING = 0.02
 #: pictures from which pixels have albedos of their own;  spread of these at first, and the least
 _PAINTED, _SPREAD, _LEAST_SPREAD = 3, 0.1, 1e-3
 _ROUNDS, _STEPS, _SETTLED = 8, 12, 1e-5
-_PIXELS, _STEEPEST = 3000, 0.8
+_PIXELS, _STEEPEST, _MOST_AROUND = 3000, 0.8, 0.3
 
 
 class MattFit(NamedTuple):
@@ -45,14 +45,15 @@ class MattFit(NamedTuple):
     rms: float
 
 
-def rough_matt(normals: FloatArray, views: FloatArray, direction: FloatArray, slope: float) -> FloatArray:
-    """Brightness (n,) of a rough matt surface of albedo 1 that faces a lamp of irradiance pi; Lambert's cosine for slope 0."""
+def rough_matt(normals: FloatArray, views: FloatArray, direction: FloatArray, slope: float, around: float = 0.0) -> FloatArray:
+    """Brightness (n,) of a rough matt surface of albedo 1 that faces a lamp of irradiance pi; Lambert's cosine for slope 0. around: what the room sends back of
+    the lamp, evenly from all sides, as share of the lamp's own."""
     c_i, c_r = normals @ direction, (normals * views).sum(1)
     lit = np.maximum(c_i, 0.0)
     s2 = slope * slope
     level, bonus = 1.0 - 0.5 * s2 / (s2 + 0.33), 0.45 * s2 / (s2 + 0.09)
     together = views @ direction - c_i * c_r
-    return lit * (level + bonus * np.maximum(together, 0.0) / np.maximum(np.maximum(lit, c_r), 1e-3))
+    return around + lit * (level + bonus * np.maximum(together, 0.0) / np.maximum(np.maximum(lit, c_r), 1e-3))
 
 
 def lights_from_matt(
@@ -192,8 +193,9 @@ def prediction_errors(
 ) -> FloatArray:
     """(k,) rms error, parts of full scale, with which each picture is predicted by a surface fitted to all others under the lights given (k, 3).
 
-    Albedo of each pixel and slope come from the other pictures under one irradiance; nothing of the predicted picture is used but its light's direction."""
-    from scipy.optimize import minimize_scalar
+    Albedo of each pixel, slope and the room's light, which shadows show, come from the other pictures under one irradiance; nothing of the predicted picture is
+    used but its light's direction."""
+    from scipy.optimize import minimize
 
     shape = (np.shape(pictures[0])[0], np.shape(pictures[0])[1])
     whole = sphere_sight(outline.centre_px, outline.radius_px, shape)
@@ -205,24 +207,27 @@ def prediction_errors(
         training = [pictures[j] for j in others]
         sphere = _Sphere(few, training, saturation)
 
-        def cost(slope: float, sphere: _Sphere = sphere, others: list[int] = others) -> float:
-            gain, shown, weight = _one_gain(sphere, lights[others], slope)
+        def cost(surface: FloatArray, sphere: _Sphere = sphere, others: list[int] = others) -> float:
+            gain, shown, weight = _one_gain(sphere, lights[others], *surface)
             off = (sphere.paint(gain * shown, weight) * gain * shown - sphere.seen) / _OUTLYING
-            used = weight > 0.0
-            return float((np.sqrt(1.0 + off[used] ** 2) - 1.0).sum())
+            return float((np.sqrt(1.0 + off[sphere.known] ** 2) - 1.0).mean())
 
-        slope = float(minimize_scalar(cost, bounds=(0.0, _STEEPEST), method="bounded", options={"xatol": 0.01}).x)
+        found = minimize(
+            cost, [0.2, 0.02], method="Nelder-Mead", bounds=((0.0, _STEEPEST), (0.0, _MOST_AROUND)),
+            options={"xatol": 3e-3, "fatol": 1e-4, "maxfev": 60},
+        )  # fmt: skip
+        slope, around = (float(x) for x in found.x)
         every = _Sphere(whole, training, saturation)
-        gain, shown, weight = _one_gain(every, lights[others], slope)
-        predicted = every.paint(gain * shown, weight) * gain * rough_matt(whole.normals, whole.views, lights[k], slope)
+        gain, shown, weight = _one_gain(every, lights[others], slope, around)
+        predicted = every.paint(gain * shown, weight) * gain * rough_matt(whole.normals, whole.views, lights[k], slope, around)
         values = np.asarray(pictures[k], np.float64).reshape(-1)[whole.pixel]
         errors.append(float(np.sqrt(((predicted - values)[values < saturation] ** 2).mean())))
     return np.array(errors)
 
 
-def _one_gain(sphere: _Sphere, lights: FloatArray, slope: float) -> tuple[float, FloatArray, FloatArray]:
-    """The gain that all pictures share, brightness (k, n) at gain 1, and weights (k, n)."""
-    shown = sphere.shown(lights, slope)
+def _one_gain(sphere: _Sphere, lights: FloatArray, slope: float, around: float) -> tuple[float, FloatArray, FloatArray]:
+    """The gain that all pictures share, brightness (k, n) at gain 1, and weights (k, n) of the lit pixels."""
+    shown = sphere.shown(lights, slope) + around
     used = (shown > _LEAST_COSINE) & sphere.known
     gain = float(np.median(sphere.seen[used] / shown[used]))
     return gain, shown, sphere.weights(lights, gain * shown)

@@ -19,10 +19,11 @@ from rangecheck.recover.lights import Light, tangents
 from rangecheck.recover.problem import Guess, Photograph, Problem, Unknowns
 from rangecheck.recover.sight import sphere_sight
 from rangecheck.studies.fit_alexander import alexander
+from rangecheck.studies.fit_classes import classes
 from rangecheck.studies.fit_refine import refinement
 from rangecheck.study import Candidate, Line, LineChart, SpeedChart, Study, measure
 
-PARTS = ("coverage", "speed", "pictures", "noise", "limits", "refine", "alexander")
+PARTS = ("coverage", "speed", "pictures", "noise", "limits", "classes", "refine", "alexander")
 NOISE = 0.01
 #: the first of the seeds on which coverage is judged: none of them was looked at while the method was made
 _FRESH = 41000
@@ -38,6 +39,7 @@ def study(quick: bool = False, part: str | None = None) -> Study:
         "pictures": _pictures,
         "noise": _noise,
         "limits": _limits,
+        "classes": classes,
         "refine": refinement,
     }
     charts: list[Any] = []

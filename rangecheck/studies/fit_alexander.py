@@ -44,11 +44,11 @@ def dented(scan: RangeScan, centre_mm: FloatArray, depth_mm: float, radius_mm: f
 
 def stepped(scan: RangeScan, centre_mm: FloatArray, angle: float, step_mm: float) -> RangeScan:
     """The scan with all that lies on one side of a line through a place further away."""
-    beyond = _along(scan.grid_points_mm, centre_mm, angle) > 0.0
+    beyond = along(scan.grid_points_mm, centre_mm, angle) > 0.0
     return replace(scan, range_mm=(scan.range_mm + np.where(beyond, step_mm, 0.0)).astype(np.float32))
 
 
-def _along(points: FloatArray, centre_mm: FloatArray, angle: float) -> FloatArray:
+def along(points: FloatArray, centre_mm: FloatArray, angle: float) -> FloatArray:
     """Distance (signed, mm, across the view) from the line through a place."""
     from_centre = points[..., :2] - centre_mm[:2]
     return np.asarray(math.cos(angle) * from_centre[..., 0] + math.sin(angle) * from_centre[..., 1])
@@ -154,7 +154,7 @@ def alexander(quick: bool) -> tuple[list[Any], list[str], list[dict[str, Any]], 
         for place in places:
             angle = float(rng.uniform(0.0, math.pi))
             found = second_view(stepped(scan, place, angle, step), right, view, step=_STEP)
-            on = [r for r in found.regions if abs(_along(points[r.cell], place, angle)) < DISC_MM + WINDOW_MM]
+            on = [r for r in found.regions if abs(along(points[r.cell], place, angle)) < DISC_MM + WINDOW_MM]
             named += bool(on)
             as_step += any(r.kind == "registration" for r in on)
             elsewhere += len(found.regions) - len(on)
