@@ -21,6 +21,7 @@ from rangecheck.errors import RangecheckError
 from rangecheck.scan.readers import read_measured
 
 COUNT = int(os.environ.get("RANGECHECK_FUZZ", "400"))
+SEED = int(os.environ.get("RANGECHECK_FUZZ_SEED", "1"))
 LONGEST_S, MOST_BYTES = 5.0, 1 << 30
 
 
@@ -84,7 +85,7 @@ def run(folder: Path, name: str, content: bytes, expect: bool = False) -> bool:
 
 def test_damaged_files_are_answered_in_time_and_in_one_line(tmp_path):
     """In a process of its own: a crash of a decoder written in C is a failure here, not the end of the run."""
-    code = f"from pathlib import Path; from fuzz.test_readers_fuzz import feed; print(feed(Path({str(tmp_path)!r}), {COUNT}, 1))"
+    code = f"from pathlib import Path; from fuzz.test_readers_fuzz import feed; print(feed(Path({str(tmp_path)!r}), {COUNT}, {SEED}))"
     root = Path(__file__).resolve().parents[1]
     done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, timeout=60 + COUNT)
     assert done.returncode == 0, (done.stderr or done.stdout)[-3000:]
