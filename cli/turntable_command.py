@@ -31,7 +31,10 @@ from .common import common, settings_from, shipped
 @click.option("--frame-format", type=click.Choice(["png", "exr"]), help="Frames as pictures, or as linear radiance or distances.")
 @click.option("--sheet", type=click.Path(), metavar="FILE", help="Also a contact sheet of all frames, a .png.")
 @click.option(
-    "--consistency", is_flag=True, help="Measure what the frames show: slope noise, speckle, jumping highlights, flagged places."
+    "--consistency",
+    is_flag=True,
+    help="Measure what the frames show: slope noise, speckle, jumping highlights, flagged places. Dents are looked for in a mirror by further "
+    "pictures of waves of light, nine from each of up to twelve poses; in a matt surface in the frames themselves, with --lights room.",
 )
 @click.option("--scheduler", metavar="ADDRESS", help="Make the frames on a dask cluster, for example tcp://10.0.0.1:8786.")
 @common("out_file", "unit", "size", "frames", "frames_dir", "tolerance", "seed", "config", "set", "force")

@@ -10,8 +10,11 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from rangecheck.analytic.bust_hair import hair_height
 from rangecheck.analytic.implicit import blend_max, blend_min, bump, disc, ellipsoid, limb, ramp, ring, soft_abs
+from rangecheck.arrays import FloatArray
 from rangecheck.kernels import kernel
 
 UNIT_MM = 1.26
@@ -261,3 +264,12 @@ def bust_function(x, y, z, heights):
     if y < 75.0:
         d = blend_min(d, _socle(x, y, z), 3.0)
     return d
+
+
+def mirrored_in_head(point_mm: FloatArray) -> FloatArray:
+    """The place (3,) mm on the other side of the head's plane of symmetry, whose features are paired."""
+    head_from_body = np.array([[_R00, _R01, _R02], [_R10, _R11, _R12], [_R20, _R21, _R22]])
+    pivot_mm = UNIT_MM * np.array(PIVOT) + np.array([0.0, CHIN_Y_MM, 0.0])
+    away = head_from_body @ (np.asarray(point_mm, float) - pivot_mm)
+    other: FloatArray = head_from_body.T @ (away * np.array([-1.0, 1.0, 1.0])) + pivot_mm
+    return other

@@ -1,64 +1,68 @@
-"""Places whose slope departs from its smooth surroundings, found in the pictures of a turntable alone: no sound surface is needed.
+"""Places that bend unlike their smooth surroundings, found in normals that pictures of a surface tell: no sound surface is needed.
 
-The surface is pictured from each pose as it is, by a noisy sensor, and as it would look if its normals were those of its own
-surroundings, averaged over twice the half width of what is looked for. Smooth shape cancels: the averaged normals keep linear and
-cubic changes of slope (twice the mean less the mean of the mean). How far the pictures depart from each other, in standard deviations of
-the sensor's noise, is gathered on the surface from all poses that see a place, as stripes and highlights pass over each place in
-some of them only; its mean magnitude is proportional to the slope that departs, as long as a stripe moves by less than its width.
+Around each place the two slopes are fitted by those of a polynomial height of degree DEGREE and of a hollow (or bump) of Gaussian form,
+over REACH half widths. Smooth shape is in the polynomial. What neither explains is the place's own clutter, and the fit is made again with the
+slopes weighed by the inverse of its covariance (2 x 2, and of the noise): a fold bends across itself alone and leaves
+the slope along it clean, and there a dent shows that is beside the fold or in it. The statistic is the hollow's share of what the
+polynomial leaves unexplained, as a ratio of lengths: the adaptive matched filter (Robey, Fuhrmann, Kelly, Nitzberg, A CFAR
+adaptive matched filter detector, 1992), with clutter told from the place itself.
 
-A place stands out by the ratio of this to the strongest of SECTORS sectors of a ring around it: the nearer of two, which knows its
-clutter best, or the farther, into which a deep defect does not spill (what it does to the averaged normals reaches 6 half widths). Ordered statistics keep the rate of
-false alarms where clutter is uneven (Rohling, Radar CFAR thresholding in clutter and multiple target situations, 1983). Folds and
-edges go on into the ring and do not stand out; a dent ends before it. Of places like all others one in SECTORS + 1 passes 1; how
-their number falls with the ratio is told from the surface's own places, and says how many would reach a ratio by chance.
+How many places of a surface would reach a ratio by chance is told from the surface's own places: beyond their median the number of
+ratios falls exponentially.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from rangecheck.arrays import BoolArray, FloatArray, IntArray
-from rangecheck.maps import Maps, trace_maps
-from rangecheck.optics import PinholeCamera, Sensor
-from rangecheck.scene import Scene
+from rangecheck.animation.measured_normals import MeasuredNormals
+from rangecheck.arrays import FloatArray, IntArray
+from rangecheck.kernels import in_chunks, inline_kernel, kernel
+from rangecheck.maps import Maps
+from rangecheck.optics import PinholeCamera
 from rangecheck.surface import Surface
-from rangecheck.surface.topology import boundary_edges
-from rangecheck.transport import Settings, Tracer
 
-#: half widths of what is looked for, mm
-HALF_WIDTHS_MM = (1.0, 2.0)
-#: in half widths: normals are averaged over SMOOTH, departures over SPOT (standard deviations); where the rings begin and end; and how
-#: far places lie APART
-SMOOTH, SPOT, RINGS, APART = 2.0, 0.5, ((3.0, 6.0), (6.0, 9.0)), 2.0
-ORDER = 2
-SECTORS, FILLED = 12, 9
-#: surfaces turned further away than this are not judged
-LEAST_COSINE = math.cos(math.radians(65.0))
-#: standard deviations of the sensor's noise that are added to both sides of a ratio: noise alone does not stand out of noise
-QUIET = 4.0
+#: half widths of what is looked for, mm: wider hollows, such as that of the throat, are form
+HALF_WIDTHS_MM = (1.0, 1.5, 2.0)
+#: in half widths: what a place is fitted over, the cells in which normals are averaged, and how far places lie APART
+REACH, CELL, APART = 4.0, 0.5, 2.0
+DEGREE = 5
+#: fits: the first with slopes weighed alike, the others by what the last left over
+FITS = 3
+#: normals that lean further than this from the place's mean are of another side; so are points further off its plane than REACH
+ALIKE = math.cos(math.radians(50.0))
+#: a place is judged when each of SECTORS sectors around it holds this share of an even one's normals, and all of them this many for each unknown
+SECTORS, FILLED, NORMALS = 8, 0.25, 2.0
+#: what is left of the noise when its expected share is taken off, in standard deviations of what is left of it
+QUIET = 3.0
 #: places that stand out by chance, expected of a whole surface
 FALSE_PLACES = 0.05
-#: largest share of the places beyond 1 that do not tell how fast their number falls: they may be defects; fewest that tell it
-DEFECTS, FEWEST = 0.05, 10
-
-_MEAN_MAGNITUDE = math.sqrt(2 / math.pi)
+#: the least share of what the polynomial leaves that the hollow must explain, however rare that is: where noise is most of what is left, few
+#: places tell how high clutter reaches
+EXPLAINED = 0.75
+#: largest share of the places beyond the median that do not tell how fast their number falls: they may be defects; fewest that tell it
+DEFECTS, FEWEST = 0.05, 20
+#: polynomial terms, and the hollow
+_TERMS = DEGREE * (DEGREE + 3) // 2 + 1
+_PLACES_PER_CHUNK = 512
 
 
 @dataclass(frozen=True, eq=False)
 class Look:
     """The places of a surface, looked at for one half width.
 
-    points_mm (k, 3); ratios (k,) by how many times each exceeds all around; beyond: how many exceed 1; rate: mean of ln(ratio) beyond 1;
-    looks: with how many half widths the surface was looked at"""
+    points_mm (k, 3); ratios (k,) of the hollow to what is left around it; depths_mm (k,), below 0 a bump; median: of the ratios; rate: mean of
+    what ratios exceed it by; looks: with how many half widths the surface was looked at"""
 
     half_width_mm: float
     points_mm: FloatArray = field(repr=False)
     ratios: FloatArray = field(repr=False)
-    beyond: int
+    depths_mm: FloatArray = field(repr=False)
+    median: float
     rate: float
     looks: int = 1
 
@@ -66,23 +70,25 @@ class Look:
         """How many places of the whole surface reach this ratio by chance, for all half widths together; infinite where too few tell."""
         if not math.isfinite(self.rate):
             return math.inf
-        return self.looks * self.beyond * max(ratio, 1.0) ** (-1 / self.rate)
+        return 0.5 * self.looks * len(self.ratios) * math.exp(-max(ratio - self.median, 0.0) / self.rate)
 
     @property
     def threshold(self) -> float:
-        """The ratio that FALSE_PLACES places are expected to reach by chance; infinite where too few tell."""
+        """The ratio that FALSE_PLACES places are expected to reach by chance, at least that of EXPLAINED; infinite where too few tell."""
         if not math.isfinite(self.rate):
             return math.inf
-        return max(self.looks * self.beyond / FALSE_PLACES, 1.0) ** self.rate
+        rare = self.median + self.rate * math.log(max(0.5 * self.looks * len(self.ratios) / FALSE_PLACES, 1.0))
+        return max(rare, math.sqrt(EXPLAINED / (1 - EXPLAINED)))
 
 
 @dataclass(frozen=True)
 class Spot:
-    """Where pictures depart from their surroundings: middle and half width, mm; how many times the strongest departure around; what
-    it takes to be named; and how many places of the surface would reach this by chance."""
+    """Where a surface bends unlike its surroundings: middle, half width and depth (below 0: a bump), mm; its ratio to what is left around
+    it; what it takes to be named; and how many places of the surface would reach this by chance."""
 
     centre_mm: tuple[float, float, float]
     half_width_mm: float
+    depth_mm: float
     ratio: float
     asked: float
     by_chance: float
@@ -114,92 +120,82 @@ class _Along:
 
 def normals_around(surface: Surface, length_mm: float) -> FloatArray:
     """(n, 3) unit normals that the surroundings of each vertex suggest, averaged along the surface over `length_mm`."""
-    along = _Along(surface)
-    rest = np.asarray(surface.vertex_normals, np.float64)
-    normals = rest.copy()
-    for _ in range(ORDER):
-        rest = rest - along.averaged(rest, length_mm)
-    normals -= rest
+    normals = _Along(surface).averaged(np.asarray(surface.vertex_normals, np.float64), length_mm)
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
 
 
-def look_at_places(
-    scene: Scene,
-    camera: PinholeCamera,
-    poses: Sequence[FloatArray],
-    settings: Settings,
-    sensor: Sensor,
-    *,
-    half_widths_mm: Sequence[float] = HALF_WIDTHS_MM,
-    seed: int = 0,
-) -> list[Look]:
-    """The scene of one wavelength pictured from each pose by `sensor`, exposed so that hardly anything saturates, and held against what
-    the normals around lead to expect: a look for each half width."""
-    surface = scene.surface
-    seen = Tracer(scene)
-    smooth = [Tracer(replace(scene, vertex_normals=normals_around(surface, SMOOTH * w))) for w in half_widths_mm]
-    departed, pixels = np.zeros((len(smooth), len(surface.vertices))), np.zeros(len(surface.vertices))
-    for k, pose in enumerate(poses):
-        maps = trace_maps(surface, camera, pose, seen.caster, allow_inside=True)
-        judged = maps.hit & (np.cos(np.nan_to_num(maps.incidence_rad, nan=3.0)) > LEAST_COSINE)
-        corner = _nearest_corner(surface, maps, judged)
-        pixels += np.bincount(corner, minlength=len(pixels))
-        picture = _grey(seen, camera, pose, settings, seed + k)
-        white = float(np.quantile(picture[maps.hit], 0.98)) if maps.hit.any() else 1.0
-        level = 0.8 / white if white > 0 else 1.0
-        exposed = replace(sensor, electrons_per_unit=sensor.full_well * level)
-        said = exposed.linearise(exposed.expose(picture, seed=seed + k))
-        for tracer, total in zip(smooth, departed):
-            share = np.clip(_grey(tracer, camera, pose, settings, seed + k) * level, 0.0, 1.0)
-            total += np.bincount(corner, (np.abs(said - share) / _noise(exposed, share))[judged], len(pixels))
-    return [_look(surface, w, total, pixels, len(smooth)) for w, total in zip(half_widths_mm, departed)]
+def look_at_places(measured: MeasuredNormals, half_widths_mm: Sequence[float] = HALF_WIDTHS_MM) -> list[Look]:
+    """A look for each half width at what pictures tell of a surface's normals."""
+    return [_look(_in_cells(measured, CELL * w), w, len(half_widths_mm)) for w in half_widths_mm]
 
 
-def _grey(tracer: Tracer, camera: PinholeCamera, pose: FloatArray, settings: Settings, seed: int) -> FloatArray:
-    return tracer.render(camera, pose, settings, seed=seed).radiance[..., 0].astype(np.float64)
+def _in_cells(measured: MeasuredNormals, cell_mm: float) -> MeasuredNormals:
+    """The mean point and normal of each cell of a grid; sides that face otherwise are kept apart."""
+    if not len(measured.points_mm):
+        return measured
+    cells = np.floor(measured.points_mm / cell_mm).astype(np.int64)
+    axis = np.abs(measured.normals).argmax(axis=1)
+    faces = 2 * axis + (np.take_along_axis(measured.normals, axis[:, None], axis=1)[:, 0] > 0)
+    cells -= cells.min(axis=0)
+    high = cells.max(axis=0) + 1
+    number = ((cells[:, 0] * high[1] + cells[:, 1]) * high[2] + cells[:, 2]) * 6 + faces
+    cell = np.unique(number, return_inverse=True)[1]
+    weight = 1 / measured.noise_rad**2
+    total = np.bincount(cell, weight)
+
+    def mean(values: FloatArray) -> FloatArray:
+        return np.stack([np.bincount(cell, weight * values[:, k]) / total for k in range(3)], axis=1)
+
+    normals = mean(measured.normals)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    noise = np.stack([np.bincount(cell, weight * weight * row) / total**2 for row in measured.covariance.T], axis=1)
+    return MeasuredNormals(mean(measured.points_mm), normals, noise)
 
 
-def _nearest_corner(surface: Surface, maps: Maps, judged: BoolArray) -> IntArray:
-    """(k,) the vertex nearest to what each judged pixel sees."""
-    corners = surface.faces[maps.face[judged]]
-    away = ((surface.vertices[corners] - maps.points_mm()[judged][:, None, :]) ** 2).sum(axis=2)
-    return np.take_along_axis(corners, away.argmin(axis=1)[:, None], axis=1)[:, 0]
+def _look(cells: MeasuredNormals, half_width_mm: float, looks: int) -> Look:
+    from scipy.spatial import cKDTree
+
+    points, count = cells.points_mm, len(cells.points_mm)
+    if not count:
+        return look_of(half_width_mm, np.empty((0, 3)), np.empty(0), np.empty(0), looks)
+    tree = cKDTree(points)
+    weight = 1 / cells.noise_rad**2
+    # weights tell which normals are surer than others, and stay of the size of one
+    weight /= weight.mean()
+    ratios, depths = np.full(count, np.nan), np.full(count, np.nan)
+
+    def chunk(start: int, stop: int) -> None:
+        near = tree.query_ball_point(points[start:stop], REACH * half_width_mm, return_sorted=True)
+        begins = np.r_[0, np.cumsum([len(who) for who in near])].astype(np.int64)
+        who = np.concatenate([np.array(some, np.int64) for some in near])
+        here = slice(start, stop)
+        _matched(
+            points,
+            cells.normals,
+            cells.covariance,
+            weight,
+            start,
+            begins,
+            who,
+            REACH * half_width_mm,
+            half_width_mm,
+            ratios[here],
+            depths[here],
+        )
+
+    in_chunks(chunk, count, _PLACES_PER_CHUNK)
+    judged = np.flatnonzero(np.isfinite(ratios))
+    highest = judged[_highest(points[judged], ratios[judged], APART * half_width_mm)]
+    return look_of(half_width_mm, points[highest], ratios[highest], depths[highest], looks)
 
 
-def _noise(sensor: Sensor, share: FloatArray) -> FloatArray:
-    """Standard deviation, in shares of full well, of what a pixel says: shot, read and rounding."""
-    steps = 2.0**sensor.bits - 1
-    level = np.rint(sensor.respond(share) * steps)
-    step = sensor.linearise(np.minimum(level + 1, steps) if sensor.bits else level) - sensor.linearise(level)
-    return np.sqrt(share / sensor.full_well + (sensor.read_noise / sensor.full_well) ** 2 + step**2 / 12)
-
-
-def _look(surface: Surface, half_width_mm: float, departed: FloatArray, pixels: FloatArray, looks: int) -> Look:
-    """From the sums, at each vertex, of the departures' magnitudes in standard deviations of the noise, and of the pixels."""
-    along, spot_mm = _Along(surface), SPOT * half_width_mm
-    density = along.averaged(pixels, spot_mm)
-    level = np.maximum(along.averaged(departed, spot_mm) / np.maximum(density, 1e-9) - _MEAN_MAGNITUDE, 0.0)
-    judged = (density > 1.0) & ~_near_border(surface, 2 * SMOOTH * half_width_mm)
-    level[~judged] = 0.0
-    places = _highest_around(surface, level, APART * half_width_mm)
-    if not len(places):
-        return look_of(half_width_mm, np.empty((0, 3)), np.empty(0), looks)
-    around = _sectors_around(surface, level, judged, places, np.multiply(RINGS, half_width_mm))
-    whole = (around >= 0).sum(axis=2) >= FILLED
-    strongest = np.where(whole, around.max(axis=2, initial=0.0), np.inf).min(axis=1)
-    places, strongest = places[np.isfinite(strongest)], strongest[np.isfinite(strongest)]
-    # magnitudes of n pixels' noise average to a standard deviation of sqrt((1 - 2 / pi) / n)
-    area = float(surface.face_areas.sum()) / len(surface.vertices)
-    averaged = float(np.median(density[judged])) / area * 4 * math.pi * spot_mm**2
-    quiet = QUIET * math.sqrt((1 - 2 / math.pi) / max(averaged, 1.0))
-    ratios = (level[places] + quiet) / (strongest + quiet)
-    return look_of(half_width_mm, surface.vertices[places], ratios, looks)
-
-
-def look_of(half_width_mm: float, points_mm: FloatArray, ratios: FloatArray, looks: int = 1) -> Look:
-    """The look, with how fast the number of its places falls beyond 1."""
-    beyond = np.sort(np.log(ratios[ratios > 1.0]))
-    return Look(half_width_mm, points_mm, ratios, len(beyond), _rate(beyond), looks)
+def look_of(
+    half_width_mm: float, points_mm: FloatArray, ratios: FloatArray, depths_mm: FloatArray | None = None, looks: int = 1
+) -> Look:
+    """The look, with how fast the number of its places falls beyond their median."""
+    median = float(np.median(ratios)) if len(ratios) else 0.0
+    depths = np.zeros(len(ratios)) if depths_mm is None else depths_mm
+    return Look(half_width_mm, points_mm, ratios, depths, median, _rate(np.sort(ratios[ratios > median] - median)), looks)
 
 
 def _rate(beyond: FloatArray) -> float:
@@ -210,62 +206,197 @@ def _rate(beyond: FloatArray) -> float:
     return float(beyond[:kept].sum() + (len(beyond) - kept) * beyond[kept - 1]) / kept
 
 
-def _near_border(surface: Surface, reach_mm: float) -> BoolArray:
-    """(n,) vertices from which it is less than `reach_mm` to where the surface ends."""
+def _highest(points: FloatArray, ratios: FloatArray, apart_mm: float) -> IntArray:
+    """Places whose ratio none exceeds within `apart_mm`."""
     from scipy.spatial import cKDTree
 
-    border = np.unique(boundary_edges(surface))
-    if not len(border):
-        return np.zeros(len(surface.vertices), bool)
-    return np.isfinite(cKDTree(surface.vertices[border]).query(surface.vertices, distance_upper_bound=reach_mm)[0])
+    if not len(points):
+        return np.empty(0, np.int64)
+    pairs = cKDTree(points).query_pairs(apart_mm, output_type="ndarray")
+    highest = np.ones(len(points), bool)
+    a, b = pairs[:, 0], pairs[:, 1]
+    highest[a[ratios[a] < ratios[b]]] = False
+    highest[b[ratios[b] < ratios[a]]] = False
+    return np.flatnonzero(highest)
 
 
-def _highest_around(surface: Surface, level: FloatArray, apart_mm: float) -> IntArray:
-    """(k,) vertices whose level none exceeds within `apart_mm`."""
-    from scipy.spatial import cKDTree
-
-    a, b = surface.faces.ravel(), np.roll(surface.faces, 1, axis=1).ravel()
-    around = np.zeros(len(level))
-    np.maximum.at(around, a, level[b])
-    np.maximum.at(around, b, level[a])
-    found = np.flatnonzero((level > 0) & (level >= around))
-    tree = cKDTree(surface.vertices[level > 0]) if len(found) else None
-    high = level[level > 0]
-    chosen = []
-    for start in range(0, len(found), 1024):
-        some = found[start : start + 1024]
-        assert tree is not None
-        near = tree.query_ball_point(surface.vertices[some], apart_mm)
-        chosen += [vertex for vertex, who in zip(some.tolist(), near) if level[vertex] >= high[who].max()]
-    return np.array(chosen, np.int64)
+@kernel
+def _factored(gram, count):
+    """Cholesky factor of the symmetric gram[:count, :count], in its lower half; False where it is singular."""
+    for i in range(count):
+        for j in range(i + 1):
+            value = gram[i, j]
+            for k in range(j):
+                value -= gram[i, k] * gram[j, k]
+            if i > j:
+                gram[i, j] = value / gram[j, j]
+            elif value <= 1e-13 * gram[0, 0]:
+                return False
+            else:
+                gram[i, i] = math.sqrt(value)
+    return True
 
 
-def _sectors_around(surface: Surface, level: FloatArray, judged: BoolArray, places: IntArray, rings_mm: FloatArray) -> FloatArray:
-    """(k, rings, SECTORS) the highest level in each sector of the rings around each place, -1 where nothing of it is judged."""
-    from scipy.spatial import cKDTree
+@kernel
+def _add_moments(a, b, hollow, su, sv, sure, plain, dented, told_u, told_v, ends):
+    """Adds one normal to the sums of which all products of two terms' slopes are made, and of terms' slopes and measured ones.
 
-    where, known = surface.vertices[judged], level[judged]
-    tree = cKDTree(where)
-    found = np.full((len(places), len(rings_mm), SECTORS), -1.0)
-    for start in range(0, len(places), 1024):
-        some = places[start : start + 1024]
-        for row, (vertex, near) in enumerate(zip(some, tree.query_ball_point(surface.vertices[some], rings_mm.max())), start):
-            who = np.array(near, np.int64)
-            away = where[who] - surface.vertices[vertex]
-            u, v = _tangents(surface.vertex_normals[vertex])
-            sector = ((np.arctan2(away @ v, away @ u) / (2 * math.pi) + 1.0) * SECTORS).astype(np.int64) % SECTORS
-            reach = np.linalg.norm(away, axis=1)
-            for ring, (begins, ends) in zip(found[row], rings_mm):
-                inside = (reach > begins) & (reach <= ends)
-                np.maximum.at(ring, sector[inside], known[who[inside]])
-    return found
+    plain[p, q] of a^p b^q; dented of the same times the hollow's e; told_u, told_v of the same times the measured slopes; ends: of e^2 (aa, ab, bb),
+    of e times measured slopes (ua, ub, va, vb), and of the measured slopes' products (uu, uv, vv)."""
+    power = sure
+    for p in range(2 * DEGREE - 1):
+        value = power
+        for q in range(2 * DEGREE - 1 - p):
+            plain[p, q] += value
+            if p + q <= DEGREE:
+                dented[p, q] += value * hollow
+                if p + q < DEGREE:
+                    told_u[p, q] += value * su
+                    told_v[p, q] += value * sv
+            value *= b
+        power *= a
+    e, e2 = sure * hollow, sure * hollow * hollow
+    ends[0], ends[1], ends[2] = ends[0] + e2 * a * a, ends[1] + e2 * a * b, ends[2] + e2 * b * b
+    ends[3], ends[4] = ends[3] + e * su * a, ends[4] + e * su * b
+    ends[5], ends[6] = ends[5] + e * sv * a, ends[6] + e * sv * b
+    ends[7], ends[8], ends[9] = ends[7] + sure * su * su, ends[8] + sure * su * sv, ends[9] + sure * sv * sv
 
 
-def _tangents(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
-    across = np.eye(3)[int(np.argmin(np.abs(normal)))]
-    u = np.cross(normal, across)
-    u /= max(float(np.linalg.norm(u)), 1e-12)
-    return u, np.cross(normal, u)
+@kernel
+def _products(plain, dented, told_u, told_v, ends, gram_uu, gram_uv, gram_vv, right):
+    """Sums over the normals of products of the terms' slopes (uv: of both orders), and of theirs with the measured ones: right[k] =
+    (uu, uv, vu, vv), terms' slope first. Terms are a^i b^j with i + j = 1 .. DEGREE, and the hollow, whose slopes are (a, b) e."""
+    last = _TERMS - 1
+    m = 0
+    for degree in range(1, DEGREE + 1):
+        for j in range(degree + 1):
+            i = degree - j
+            n = 0
+            for other in range(1, degree + 1):
+                for n_b in range(other + 1):
+                    k = other - n_b
+                    gram_uu[m, n] = i * k * plain[i + k - 2, j + n_b] if i > 0 and k > 0 else 0.0
+                    gram_vv[m, n] = j * n_b * plain[i + k, j + n_b - 2] if j > 0 and n_b > 0 else 0.0
+                    gram_uv[m, n] = (i * n_b + j * k) * plain[i + k - 1, j + n_b - 1] if i + k > 0 and j + n_b > 0 else 0.0
+                    n += 1
+            gram_uu[last, m] = i * dented[i, j]
+            gram_vv[last, m] = j * dented[i, j]
+            gram_uv[last, m] = (i * dented[i - 1, j + 1] if i > 0 else 0.0) + (j * dented[i + 1, j - 1] if j > 0 else 0.0)
+            right[m, 0] = i * told_u[i - 1, j] if i > 0 else 0.0
+            right[m, 1] = i * told_v[i - 1, j] if i > 0 else 0.0
+            right[m, 2] = j * told_u[i, j - 1] if j > 0 else 0.0
+            right[m, 3] = j * told_v[i, j - 1] if j > 0 else 0.0
+            m += 1
+    gram_uu[last, last], gram_uv[last, last], gram_vv[last, last] = ends[0], 2.0 * ends[1], ends[2]
+    right[last, 0], right[last, 1], right[last, 2], right[last, 3] = ends[3], ends[5], ends[4], ends[6]
+
+
+@inline_kernel
+def _between(noise, j, ax, ay, az, bx, by, bz):
+    """a . covariance . b of normal j."""
+    x = noise[j, 0] * bx + noise[j, 1] * by + noise[j, 2] * bz
+    y = noise[j, 1] * bx + noise[j, 3] * by + noise[j, 4] * bz
+    z = noise[j, 2] * bx + noise[j, 4] * by + noise[j, 5] * bz
+    return ax * x + ay * y + az * z
+
+
+@kernel
+def _form(gram, vector):
+    """vector . gram . vector, of a symmetric gram known in its lower half."""
+    total = 0.0
+    for i in range(len(vector)):
+        total += gram[i, i] * vector[i] * vector[i]
+        for j in range(i):
+            total += 2.0 * gram[i, j] * vector[i] * vector[j]
+    return total
+
+
+@kernel
+def _matched(points, normals, noise, weight, first, begins, who, reach, half_width, ratios, depths):
+    """Ratio and depth of the hollow at each of the places first, first + 1, ...; `who` are the normals within reach of each."""
+    plain, dented = np.empty((2 * DEGREE - 1, 2 * DEGREE - 1)), np.empty((DEGREE + 1, DEGREE + 1))
+    told_u, told_v, ends = np.empty((DEGREE, DEGREE)), np.empty((DEGREE, DEGREE)), np.empty(10)
+    gram_uu, gram_uv, gram_vv = np.zeros((_TERMS, _TERMS)), np.zeros((_TERMS, _TERMS)), np.zeros((_TERMS, _TERMS))
+    gram, products, right, sector = np.empty((_TERMS, _TERMS)), np.empty((_TERMS, 4)), np.empty(_TERMS), np.empty(SECTORS)
+    for s in range(len(ratios)):
+        me = first + s
+        mx, my, mz = 0.0, 0.0, 0.0
+        for t in range(begins[s], begins[s + 1]):
+            j = who[t]
+            if normals[j, 0] * normals[me, 0] + normals[j, 1] * normals[me, 1] + normals[j, 2] * normals[me, 2] > ALIKE:
+                mx, my, mz = mx + normals[j, 0], my + normals[j, 1], mz + normals[j, 2]
+        length = math.sqrt(mx * mx + my * my + mz * mz)
+        if length == 0.0:
+            continue
+        mx, my, mz = mx / length, my / length, mz / length
+        # Duff and others, Building an orthonormal basis, revisited, 2017
+        sign = 1.0 if mz >= 0.0 else -1.0
+        c = -1.0 / (sign + mz)
+        d = mx * my * c
+        ux, uy, uz = 1.0 + sign * mx * mx * c, sign * d, -sign * mx
+        vx, vy, vz = d, sign + my * my * c, -my
+        plain[:], dented[:], told_u[:], told_v[:], ends[:], sector[:] = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        count, nuu, nuv, nvv = 0, 0.0, 0.0, 0.0
+        for t in range(begins[s], begins[s + 1]):
+            j = who[t]
+            ahead = normals[j, 0] * mx + normals[j, 1] * my + normals[j, 2] * mz
+            if ahead < ALIKE:
+                continue
+            dx, dy, dz = points[j, 0] - points[me, 0], points[j, 1] - points[me, 1], points[j, 2] - points[me, 2]
+            x, y = dx * ux + dy * uy + dz * uz, dx * vx + dy * vy + dz * vz
+            hollow = math.exp(-0.5 * (x * x + y * y) / half_width**2)
+            su = -(normals[j, 0] * ux + normals[j, 1] * uy + normals[j, 2] * uz) / ahead
+            sv = -(normals[j, 0] * vx + normals[j, 1] * vy + normals[j, 2] * vz) / ahead
+            nuu += weight[j] * _between(noise, j, ux, uy, uz, ux, uy, uz)
+            nuv += weight[j] * _between(noise, j, ux, uy, uz, vx, vy, vz)
+            nvv += weight[j] * _between(noise, j, vx, vy, vz, vx, vy, vz)
+            _add_moments(x / reach, y / reach, hollow, su, sv, weight[j], plain, dented, told_u, told_v, ends)
+            sector[int((math.atan2(y, x) / (2.0 * math.pi) + 1.0) * SECTORS) % SECTORS] += 1.0
+            count += 1
+        if count < NORMALS * _TERMS or sector.min() * SECTORS < FILLED * count:
+            continue
+        _products(plain, dented, told_u, told_v, ends, gram_uu, gram_uv, gram_vv, products)
+        wuu, wuv, wvv = 1.0, 0.0, 1.0
+        for _ in range(FITS):
+            for i in range(_TERMS):
+                right[i] = wuu * products[i, 0] + wuv * (products[i, 1] + products[i, 2]) + wvv * products[i, 3]
+                for j in range(i + 1):
+                    gram[i, j] = wuu * gram_uu[i, j] + wuv * gram_uv[i, j] + wvv * gram_vv[i, j]
+            if not _factored(gram, _TERMS):
+                ratios[s] = np.nan
+                break
+            total = wuu * ends[7] + 2.0 * wuv * ends[8] + wvv * ends[9]
+            rest = total
+            for i in range(_TERMS):
+                for j in range(i):
+                    right[i] -= gram[i, j] * right[j]
+                right[i] /= gram[i, i]
+                rest -= right[i] * right[i]
+            # the hollow is the last term: what it explains beyond all others is the square of its own entry
+            # of what is left, the share of the noise is known; it averages out, as clutter does not
+            of_noise = wuu * nuu + 2.0 * wuv * nuv + wvv * nvv
+            clutter = max(rest - of_noise, 0.0) + QUIET * of_noise / math.sqrt(count)
+            ratios[s] = abs(right[_TERMS - 1]) / math.sqrt(max(clutter, 1e-12 * total))
+            for i in range(_TERMS - 1, -1, -1):
+                for j in range(i + 1, _TERMS):
+                    right[i] -= gram[j, i] * right[j]
+                right[i] /= gram[i, i]
+            depths[s] = right[_TERMS - 1] * half_width**2 / reach
+            # what is left of each slope, and of their product: sums of squares about the fit
+            cuu, cuv, cvv = (
+                ends[7] + _form(gram_uu, right),
+                ends[8] + 0.5 * _form(gram_uv, right),
+                ends[9] + _form(gram_vv, right),
+            )
+            for i in range(_TERMS):
+                cuu -= 2.0 * right[i] * products[i, 0]
+                cuv -= right[i] * (products[i, 1] + products[i, 2])
+                cvv -= 2.0 * right[i] * products[i, 3]
+            # the noise bounds from below what a slope can be off by
+            cuu, cvv = max(cuu, nuu), max(cvv, nvv)
+            cuv = math.copysign(min(abs(cuv), 0.999 * math.sqrt(cuu * cvv)), cuv)
+            size = (cuu * cvv - cuv * cuv) / plain[0, 0]
+            wuu, wuv, wvv = cvv / size, -cuv / size, cuu / size
 
 
 def pixel_width_mm(maps: Maps) -> float:
@@ -274,18 +405,17 @@ def pixel_width_mm(maps: Maps) -> float:
     return float(np.nanmedian(maps.depth_mm)) / maps.camera.fx if maps.hit.any() else 1.0
 
 
-def spots(looks: Sequence[Look], false_places: float = FALSE_PLACES) -> list[Spot]:
-    """Places of which at most `false_places` are expected by chance, the least likely first, each once within the ring of the wider."""
+def spots(looks: Sequence[Look]) -> list[Spot]:
+    """Places that reach what is asked, the least likely by chance first, each once within reach of the wider."""
     found: list[Spot] = []
     for look in looks:
-        for point, ratio in zip(look.points_mm, look.ratios):
+        for point, ratio, depth in zip(look.points_mm, look.ratios, look.depths_mm):
             by_chance = look.expected(float(ratio))
-            if ratio > 1.0 and by_chance <= false_places:
+            if ratio >= look.threshold:
                 x, y, z = (float(c) for c in point)
-                found.append(Spot((x, y, z), look.half_width_mm, float(ratio), look.threshold, by_chance))
+                found.append(Spot((x, y, z), look.half_width_mm, float(depth), float(ratio), look.threshold, by_chance))
     kept: list[Spot] = []
     for spot in sorted(found, key=lambda spot: (spot.by_chance, spot.centre_mm)):
-        reach = RINGS[0][0] * spot.half_width_mm
-        if all(math.dist(spot.centre_mm, other.centre_mm) > max(reach, RINGS[0][0] * other.half_width_mm) for other in kept):
+        if all(math.dist(spot.centre_mm, o.centre_mm) > REACH * max(spot.half_width_mm, o.half_width_mm) for o in kept):
             kept.append(spot)
     return kept

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,12 +22,21 @@ from rangecheck.animation import (
     verdict_for,
 )
 from rangecheck.animation.consistency import Outline
+from rangecheck.animation.measured_normals import (
+    SHIFTS,
+    LitPicture,
+    MeasuredNormals,
+    noise_of,
+    normals_in_shading,
+    normals_in_waves,
+)
 from rangecheck.animation.standing_out import (
     FALSE_PLACES,
     HALF_WIDTHS_MM,
     Look,
     Spot,
     look_at_places,
+    normals_around,
     pixel_width_mm,
     spots,
 )
@@ -50,8 +60,14 @@ VIEWS, VIEW_PX = 8, 320
 JUDGED = 40_000
 #: flagged places that are named
 NAMED = 10
-#: poses of the turntable, and rays through each pixel, from which places that stand out in mirrored light are looked for
+#: poses of the turntable, and rays through each pixel, from which normals are measured in mirrored waves
 STANDING_VIEWS, STANDING_RAYS = 12, 4
+#: frames of a matt turntable that are measured, at most: every so many of them
+STANDING_FRAMES = 72
+#: darker and brighter pixels of a frame, in shares of white, tell nothing of how much light there was
+DARKEST, BRIGHTEST = 0.02, 0.98
+#: pixels over which known normals are averaged where the search for the measured ones begins
+SMOOTHED_PX = 4.0
 #: by a sensor of 8 bits, where the settings have none
 PLAIN_SENSOR = Sensor(full_well=20_000.0, read_noise=10.0, response="srgb")
 #: without a printer in the settings
@@ -86,12 +102,18 @@ def known_of(
 
 @dataclass(frozen=True)
 class Standing:
-    """Places where mirrored light departs from what the normals around lead to expect, and the looks at the surface that name them."""
+    """Places that bend unlike their surroundings in normals that pictures tell, and the looks at the surface that name them.
+
+    shown: `waves` in a mirror, `frames` of a matt surface; pictures: how many were measured, from how many views; noise_deg: the median of how well
+    a slope is known at a vertex"""
 
     spots: tuple[Spot, ...]
     looks: tuple[Look, ...]
+    shown: str
+    pictures: int
     views: int
     pixel_mm: float
+    noise_deg: float | None
 
     @property
     def places(self) -> int:
@@ -102,10 +124,10 @@ class Standing:
         """JSON-ready."""
         return {
             "places": [vars(spot) for spot in self.spots[:NAMED]], "flagged": len(self.spots), "places_judged": self.places,
-            "false_places_expected": FALSE_PLACES, "views": self.views, "pixel_mm": self.pixel_mm,
+            "false_places_expected": FALSE_PLACES, "shown": self.shown, "pictures": self.pictures, "views": self.views,
+            "pixel_mm": self.pixel_mm, "noise_deg": self.noise_deg,
             "looks": [
-                {"half_width_mm": look.half_width_mm, "threshold": look.threshold, "places": len(look.ratios), "beyond_their_surroundings": look.beyond}
-                for look in self.looks
+                {"half_width_mm": look.half_width_mm, "threshold": look.threshold, "places": len(look.ratios)} for look in self.looks
             ],
         }  # fmt: skip
 
@@ -113,37 +135,71 @@ class Standing:
         """For people."""
         if not any(np.isfinite(look.threshold) for look in self.looks):
             return [
-                f"places that stand out of what they mirror: not told; pixels of {self.pixel_mm:.2g} mm leave {self.places} places to "
+                f"places that bend unlike their surroundings: not told; pixels of {self.pixel_mm:.2g} mm leave {self.places} places to "
                 "compare (larger --size shows more)"
             ]
+        how = (
+            f"{self.pictures} further pictures of mirrored waves, from {self.views} poses"
+            if self.shown == "waves"
+            else f"{self.pictures} frames"
+        )
         said = [
-            f"in mirrored light {len(self.spots)} of {self.places:,} places stand out of all that is around them, where chance would name "
-            f"{FALSE_PLACES:g}"
+            f"{how} tell slopes to {self.noise_deg:.2g} degrees; {len(self.spots)} of {self.places:,} places bend unlike their surroundings, where "
+            f"chance would name {FALSE_PLACES:g}"
         ]
         for spot in self.spots[:3]:
             x, y, z = spot.centre_mm
             said.append(
-                f"  stands out of its surroundings at ({x:.1f}, {y:.1f}, {z:.1f}) mm, about {2 * spot.half_width_mm:g} mm wide: {spot.ratio:.1f} times the "
-                f"most that is around it ({spot.asked:.1f} are asked)"
+                f"  a {'dent' if spot.depth_mm > 0 else 'bump'} at ({x:.1f}, {y:.1f}, {z:.1f}) mm, about {2 * spot.half_width_mm:g} mm wide and "
+                f"{abs(spot.depth_mm):.2g} mm {'deep' if spot.depth_mm > 0 else 'high'}: {spot.ratio:.1f} times what is left around it "
+                f"({spot.asked:.1f} are asked)"
             )
         return said
 
 
-def standing_of(scene: Scene, camera: PinholeCamera, orbit: Orbit, sensor: Sensor | None, seed: int) -> Standing:
-    """What stands out of its own surroundings in a turntable's mirrored light, from STANDING_VIEWS of its own poses."""
+def standing_in_waves(scene: Scene, camera: PinholeCamera, orbit: Orbit, sensor: Sensor | None, seed: int) -> Standing:
+    """What stands out of its surroundings in the mirrors of a turntable, surrounded by waves, from STANDING_VIEWS of its poses."""
     straight = replace(camera, distortion=())
     chosen = sorted({k * orbit.frames // STANDING_VIEWS for k in range(STANDING_VIEWS)})
-    followed = LightSettings(passes=1, each=STANDING_RAYS, diffuse=False, depth=1, backdrop=False)
     poses = [orbit.world_from_camera(k) for k in chosen]
+    followed = LightSettings(passes=1, each=STANDING_RAYS, diffuse=False, depth=1, backdrop=False)
     pixel = pixel_width_mm(trace_maps(scene.surface, straight, poses[0], allow_inside=True))
-    # what is looked for must be at least as wide as two pixels
-    widths = [width for width in HALF_WIDTHS_MM if pixel <= width]
-    found = (
-        look_at_places(scene.grey(), straight, poses, followed, sensor or PLAIN_SENSOR, half_widths_mm=widths, seed=seed)
-        if widths
-        else []
-    )
-    return Standing(tuple(spots(found)), tuple(found), len(poses), pixel)
+    measured = normals_in_waves(scene, straight, poses, followed, sensor or PLAIN_SENSOR, seed=seed) if _widths(pixel) else None
+    return _standing(measured, "waves", 3 * SHIFTS * len(poses), len(poses), pixel)
+
+
+def standing_in_frames(
+    scene: Scene, camera: PinholeCamera, orbit: Orbit, picture: Callable[[int], npt.NDArray[Any]], exposure: float, sensor: Sensor | None
+) -> Standing:  # fmt: skip
+    """What stands out of its surroundings in the frames themselves of a matt turntable whose model turns under lights that stand still.
+
+    picture(i) is frame i as developed with `exposure`, or by `sensor`."""
+    seen_by = sensor or PLAIN_SENSOR
+    step = -(-orbit.frames // STANDING_FRAMES)
+    lit, chosen = [], range(0, orbit.frames, step)
+    pixel = pixel_width_mm(trace_maps(scene.surface, camera, orbit.world_from_camera(0), allow_inside=True))
+    for index in chosen if _widths(pixel) else ():
+        shown = seen_by.linearise(picture(index))
+        share = shown if shown.ndim == 2 else shown.mean(axis=2)
+        light = np.where((share > DARKEST) & (share < BRIGHTEST), share / exposure, np.nan)
+        turned = scene.lights_moved(orbit.world_from_turned(index))
+        lit.append(LitPicture(light, noise_of(seen_by, share) / exposure, orbit.world_from_camera(index), turned.sources))
+    measured = None
+    if lit:
+        around = normals_around(scene.surface, SMOOTHED_PX * pixel)
+        measured = normals_in_shading(scene.surface, camera, lit, around)
+    return _standing(measured, "frames", len(chosen), len(chosen), pixel)
+
+
+def _widths(pixel_mm: float) -> list[float]:
+    """Half widths of what can be looked for: it must be at least as wide as two pixels."""
+    return [width for width in HALF_WIDTHS_MM if pixel_mm <= width]
+
+
+def _standing(measured: MeasuredNormals | None, shown: str, pictures: int, views: int, pixel_mm: float) -> Standing:
+    found = [] if measured is None else look_at_places(measured, _widths(pixel_mm))
+    noise = math.degrees(float(np.median(measured.noise_rad))) if measured is not None and len(measured.noise_rad) else None
+    return Standing(tuple(spots(found)), tuple(found), shown, pictures, views, pixel_mm, noise)
 
 
 def judge(
@@ -152,8 +208,8 @@ def judge(
 ) -> tuple[dict[str, Any], list[str], list[npt.NDArray[np.uint8]]]:  # fmt: skip
     """JSON-ready numbers, lines for people, and pictures of the flagged places from the sides that show most of them.
 
-    `frames` are pictures of the turntable in a material that mirrors; `known` saves measuring what needs none; `standing` is what stands
-    out in mirrored light: it takes pictures of its own, which the whole job does not make."""
+    `frames` are pictures of the turntable in a material that mirrors; `known` saves measuring what needs none; `standing` is what bends
+    unlike its surroundings: in mirrors it takes pictures of its own, which the whole job does not make."""
     known = known or known_of(surface, scans, orbit, settings, standing)
     speckle = speckle_of(frames)
     machine = printer(settings.solid.printer or PRINTER)
@@ -214,8 +270,8 @@ def _lines(found: Consistency, speckle: Speckle | None, outlines: dict[str, Any]
 
 
 def _drawn(surface: Surface, found: Consistency, views: Sequence[Maps], standing: Sequence[Spot]) -> list[npt.NDArray[np.uint8]]:
-    """Slope residuals in colour from the first view and the one opposite, flagged places ringed: blue by their slopes, green by what
-    they mirror."""
+    """Slope residuals in colour from the first view and the one opposite, flagged places ringed: blue by their facets' slopes, green by
+    those that pictures tell."""
     import cv2
     from scipy.spatial import cKDTree
 

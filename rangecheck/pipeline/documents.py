@@ -125,9 +125,9 @@ def _consistency(speckle: Shape, outline: Shape, place: Shape) -> dict[str, Shap
         "speckle": or_null(speckle), "outlines": by_name(outline), "places": many(place), "places_flagged": COUNT, "printer": TEXT,
         "height_mm": NUMBER, "fit": FLAG, "verdict": TEXT, "views": COUNT,
         "standing_out": maybe(or_null(record(
-            places=many(record(centre_mm=POINT, half_width_mm=NUMBER, ratio=NUMBER, asked=NUMBER, by_chance=NUMBER)), flagged=COUNT,
-            places_judged=COUNT, false_places_expected=NUMBER, views=COUNT, pixel_mm=NUMBER,
-            looks=many(record(half_width_mm=NUMBER, threshold=NUMBER, places=COUNT, beyond_their_surroundings=COUNT)),
+            places=many(record(centre_mm=POINT, half_width_mm=NUMBER, depth_mm=NUMBER, ratio=NUMBER, asked=NUMBER, by_chance=NUMBER)), flagged=COUNT,
+            places_judged=COUNT, false_places_expected=NUMBER, shown=one_of("waves", "frames"), pictures=COUNT, views=COUNT, pixel_mm=NUMBER,
+            noise_deg=or_null(NUMBER), looks=many(record(half_width_mm=NUMBER, threshold=NUMBER, places=COUNT)),
         ))),
     }  # fmt: skip
 

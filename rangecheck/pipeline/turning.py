@@ -28,8 +28,9 @@ from rangecheck.export.pictures import exposure_from, png_bytes, read_png, write
 from rangecheck.export.video import FORMATS, find_encoder
 from rangecheck.files import read_json
 from rangecheck.maps import trace_maps
+from rangecheck.optics import PinholeCamera
 from rangecheck.pipeline.camera import Optics, camera_of, developed, image_of, optics_of, take
-from rangecheck.pipeline.consistency import judge, standing_of, write_consistency
+from rangecheck.pipeline.consistency import Standing, judge, standing_in_frames, standing_in_waves, write_consistency
 from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.pictures import plan_of, scene_of
 from rangecheck.pipeline.subject import Subject, read_subject
@@ -300,6 +301,23 @@ def _make(
         write_colmap(folder / "colmap", [job.optics.asked] * len(poses), poses, names)
 
 
+def _standing(made: Sequence[_Made], mirrored: _Made | None, settings: Settings) -> Standing | None:
+    """Places that bend unlike their surroundings: in waves where something mirrors, else in the frames themselves where their lights move over
+    the model, each pixel sees it sharply and in a line, and no light is gathered from elsewhere but evenly."""
+    if mirrored is not None:
+        job = mirrored.job
+        return standing_in_waves(job.scene, camera_of(settings), job.orbit, job.optics.sensor, settings.seed)
+    matt = next((m for m in made if m.job.plan is not None and m.job.show == "picture" and m.job.lights == "room"), None)
+    if matt is None:
+        return None
+    job, optics = matt.job, matt.job.optics
+    camera = optics.camera
+    if not isinstance(camera, PinholeCamera) or any(camera.distortion) or optics.lens is not None or optics.vignetting:
+        return None
+    exposure = float(read_json(matt.frames[0].with_name(MANIFEST))["exposure"])
+    return standing_in_frames(job.scene, camera, job.orbit, matt.picture, exposure, optics.sensor)
+
+
 def exposure_of(images: Sequence[FloatArray]) -> float:
     """One exposure for images (h, w, c) of one or three wavelengths."""
     return exposure_from([image[..., 0] if image.shape[2] == 1 else image for image in images])
@@ -372,9 +390,7 @@ def turntable(
         with reporter.stage("consistency"):
             mirrored = next((m for m in made if m.job.plan is not None and any(map(_mirrors, m.job.scene.materials))), None)
             shown = () if mirrored is None else mirrored.pictures()
-            standing = None
-            if mirrored is not None:
-                standing = standing_of(mirrored.job.scene, camera_of(settings), orbit, mirrored.job.optics.sensor, settings.seed)
+            standing = _standing(made, mirrored, settings)
             judged, said, pictures = judge(subject.surface, subject.scans, orbit, settings, shown, standing=standing)
             write_consistency(folder, judged, pictures)
         lines += said
