@@ -186,3 +186,31 @@ def _ball() -> Surface:
 
     mesh = trimesh.creation.icosphere(subdivisions=4, radius=50.0)
     return Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces).astype(np.int32))
+
+
+def test_the_proposed_view_adds_more_than_nearly_all_others_when_each_is_tried():
+    """From the front alone: each of some directions is simulated, and what it adds is counted in readings far from all that are there."""
+    from scipy.spatial import cKDTree
+
+    finder = RangeFinder(source_mm=(100.0, 0.0, 0.0), working_distance_mm=600.0, noise_mm=0.1)
+    subject = pebble(1)
+
+    def shot(direction):
+        up = (0, 1, 0) if abs(direction[1]) < 0.99 else (0, 0, 1)
+        pose = rigid.look_at(600.0 * np.asarray(direction), (0, 0, 0), up)
+        return simulate_scan(subject, CAMERA, pose, finder, 7).scan
+
+    front = [shot([np.sin(a), 0.0, np.cos(a)]) for a in np.radians([-45.0, 0.0, 45.0])]
+    quality = assess(front, cells=CELLS)
+    known = cKDTree(np.concatenate([scan.points_mm() for scan in front]))
+
+    def worth(direction):
+        apart = known.query(shot(direction).points_mm())[0]
+        new, overlap = (apart > 3 * quality.spacing_mm).sum(), (apart <= 3 * quality.spacing_mm).mean()
+        return new * min(1.0, overlap / 0.25)  # what could not be aligned adds nothing
+
+    ways = directions(60)
+    others = np.array([worth(way) for way in ways[np.degrees(np.arcsin(ways[:, 1])) > -30]])
+    assert quality.next_view is not None
+    proposed = worth(quality.next_view.direction)
+    assert proposed > 0.8 * others.max() and (others > proposed).mean() < 0.15

@@ -18,6 +18,7 @@ from rangecheck import rigid
 from rangecheck.arrays import FloatArray, require, unit_vectors
 from rangecheck.errors import ScanError, SettingError
 from rangecheck.kernels import in_chunks
+from rangecheck.scan.quality_expected import expected
 from rangecheck.scan.quality_space import (
     Gap,
     NextView,
@@ -205,7 +206,7 @@ def assess(
     allowed = directions(candidates)
     elevations = np.degrees(np.arcsin(np.clip(allowed @ upward, -1, 1)))
     allowed = allowed[(elevations >= elevation_deg[0]) & (elevations <= elevation_deg[1])]
-    gain, known, reachable = views_from(space, shell, allowed)
+    _, _, reachable = views_from(space, shell, allowed)
     unseen = float(shell.area_mm2[~shell.measured & reachable].sum())
     hidden = float(shell.area_mm2[~shell.measured & ~reachable].sum())
     seen = float(shell.area_mm2[shell.measured].sum())
@@ -223,7 +224,7 @@ def assess(
     return ScanQuality(
         views, tuple(p for p, *_ in judged.values() if p.overlap > 0), height, scale, _coverage(points, middle), share, unseen, hidden,
         tuple(gaps), float(np.average(np.sqrt(areas), weights=areas)) if len(areas) else 0.0, spacing, error, step,
-        _next_view(allowed, gain, known, unseen, space, shell, reachable, upward), wanted, tuple(findings),
+        _next_view(allowed, space, upward), wanted, tuple(findings),
     )  # fmt: skip
 
 
@@ -298,20 +299,27 @@ def _view(k: int, scans, samples: Sequence[Samples], judged, middle: FloatArray,
     )  # fmt: skip
 
 
-def _next_view(allowed, gain, known, unseen: float, space: Space, shell: Shell, reachable, up: FloatArray) -> NextView | None:
-    if not len(allowed) or not gain.max(initial=0.0) > 4 * space.cell_mm**2:
+def _next_view(allowed: FloatArray, space: Space, up: FloatArray) -> NextView | None:
+    """The allowed direction that sees most of the surface that may be expected where none was measured."""
+    if not len(allowed):
         return None
+    likely = expected(space)
+    shell = shell_of(likely)
+    gain, known, reachable = views_from(likely, shell, allowed)
+    if not gain.max(initial=0.0) > 4 * space.cell_mm**2:
+        return None
+    unseen = float(shell.area_mm2[~shell.measured & reachable].sum())
     overlap = known / np.maximum(known + gain, 1e-12)
     # a view that could not be aligned adds nothing; of equal ones the first
     k = int(np.argmax(np.where(overlap >= _TO_ALIGN, gain, gain * overlap / _TO_ALIGN)))
     azimuth, elevation = angles_deg(allowed[k], up)
-    _, _, sees = views_from(space, shell, allowed[k : k + 1])
+    _, _, sees = views_from(likely, shell, allowed[k : k + 1])
     adds = sees & ~shell.measured
-    where = np.average(space.centres_mm(shell.index[adds]), axis=0, weights=shell.area_mm2[adds])
+    where = np.average(likely.centres_mm(shell.index[adds]), axis=0, weights=shell.area_mm2[adds])
     reason = (
         f"from azimuth {azimuth:.0f}, elevation {elevation:.0f} degrees it sees {gain[k] / 100:.1f} cm2 (foreshortened) of the "
-        f"{unseen / 100:.1f} cm2 that no scan has seen, around ({', '.join(f'{x:.0f}' for x in where)}) mm; {100 * overlap[k]:.0f} % of its "
-        "picture is known already"
+        f"{unseen / 100:.1f} cm2 that may be expected where no scan has seen anything, around ({', '.join(f'{x:.0f}' for x in where)}) mm; "
+        f"{100 * overlap[k]:.0f} % of its picture is known already"
     )
     return NextView(tuple(allowed[k].tolist()), azimuth, elevation, float(gain[k]), float(overlap[k]), reason)
 
