@@ -214,3 +214,14 @@ def test_the_proposed_view_adds_more_than_nearly_all_others_when_each_is_tried()
     assert quality.next_view is not None
     proposed = worth(quality.next_view.direction)
     assert proposed > 0.8 * others.max() and (others > proposed).mean() < 0.15
+
+
+def test_every_finding_of_scans_is_explained():
+    import re
+    from pathlib import Path
+
+    import rangecheck.scan.quality as quality
+    from rangecheck.solid.findings import catalogue
+
+    codes = set(re.findall(r'"(scan-[a-z]+)"', Path(quality.__file__).read_text()))
+    assert len(codes) >= 7 and codes <= set(catalogue())
