@@ -216,6 +216,12 @@ def test_the_proposed_view_adds_more_than_nearly_all_others_when_each_is_tried()
     assert proposed > 0.8 * others.max() and (others > proposed).mean() < 0.15
 
 
+def test_an_object_of_unlikely_size_puts_its_unit_in_doubt(views):
+    small = [replace(scan, range_mm=scan.range_mm / 1000, world_from_scan=scaled(scan.world_from_scan)) for scan in views[:3]]
+    assert any(f.code == "scan-size" for f in assess(small, cells=CELLS).findings)
+    assert not any(f.code == "scan-size" for f in assess(views[:3], cells=CELLS).findings)
+
+
 def test_every_finding_of_scans_is_explained():
     import re
     from pathlib import Path
@@ -224,4 +230,10 @@ def test_every_finding_of_scans_is_explained():
     from rangecheck.solid.findings import catalogue
 
     codes = set(re.findall(r'"(scan-[a-z]+)"', Path(quality.__file__).read_text()))
-    assert len(codes) >= 7 and codes <= set(catalogue())
+    assert len(codes) >= 8 and codes <= set(catalogue())
+
+
+def scaled(pose):
+    smaller = pose.copy()
+    smaller[:3, 3] /= 1000
+    return smaller

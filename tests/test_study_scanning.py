@@ -68,3 +68,8 @@ def test_a_ring_sees_the_bust_from_as_many_sides_as_asked():
     eyes = np.array([scan.world_from_scan[:3, 3] for scan in ring])
     assert len({tuple(np.round(eye, 3)) for eye in eyes}) == 3
     assert all(scan.valid.mean() > 0.1 for scan in ring)
+
+
+def test_the_study_of_scans_times_reading():
+    found = study_named("scans", "reading")(quick=True)
+    assert found.tables["reading"][0]["what"] == "depth PNG of 512 x 512" and found.tables["reading"][0]["seconds"] > 0

@@ -42,6 +42,8 @@ GRAZING_DEG = 60.0
 _COVERAGE, _CANDIDATES = 2048, 400
 #: overlap with what is known that a next view should have, so that it can be aligned
 _TO_ALIGN = 0.25
+#: heights of what range finders are pointed at; outside, the unit is in doubt
+LIKELY_MM = (5.0, 20_000.0)
 
 
 @dataclass(frozen=True)
@@ -339,6 +341,10 @@ def _findings(views, wanted: Profile, scale, seen, unseen, spacing, error, step,
         f"{100 * (1 - seen):.1f} % of the surface in reach ({unseen / 100:.0f} cm2) was never seen, in {len(gaps)} gaps{largest} "
         f"(at most {100 * wanted.most_unseen:.0f} %); "
         + ("one scan makes a relief, and a bust takes more" if len(views) == 1 else "scan again from the next view"))  # fmt: skip
+    height = wanted.height_mm / scale
+    if not LIKELY_MM[0] <= height <= LIKELY_MM[1]:
+        found.append(Finding("scan-size", "warning", f"the object is {height:.3g} mm high (from {LIKELY_MM[0]:g} to {LIKELY_MM[1]:g} mm is likely); "
+                             "is its unit right? Say another --unit, if not", height, LIKELY_MM[0] if height < LIKELY_MM[0] else LIKELY_MM[1]))  # fmt: skip
     add("scan-spacing", scale * spacing, wanted.most_spacing_mm, 3 * wanted.most_spacing_mm,
         f"samples lie {scale * spacing:.2f} mm apart at the print (at most {wanted.most_spacing_mm:g} mm); scan from nearer, or print smaller")  # fmt: skip
     add("scan-error", scale * error, wanted.most_error_mm, 4 * wanted.most_error_mm,

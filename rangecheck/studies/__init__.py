@@ -22,6 +22,7 @@ STUDIES = {
     "meshing": "rangecheck.studies.meshing",
     "reflectance": "rangecheck.studies.reflectance",
     "registration": "rangecheck.studies.registration",
+    "scans": "rangecheck.studies.scans",
     "transport": "rangecheck.studies.transport",
     "rays": "rangecheck.studies.rays",
     "repair": "rangecheck.studies.repair",
