@@ -11,11 +11,11 @@ from rangecheck.scan.simulate import RangeFinder, ring_of_poses, simulate_scan
 CAMERA = PinholeCamera.from_field_of_view(150, 120, 22)
 
 
-def pebble(seed: int, roughness: float = 0.09) -> EmbreeCaster:
-    """A closed, star-shaped object of about 80 mm radius whose bumps repeat nowhere."""
+def pebble(seed: int, roughness: float = 0.09, ridges_mm: float = 0.0) -> EmbreeCaster:
+    """A closed, star-shaped object of about 80 mm radius whose bumps repeat nowhere, with ridges of this height and some 5 mm apart."""
     import trimesh
 
-    ball = trimesh.creation.icosphere(subdivisions=5)
+    ball = trimesh.creation.icosphere(subdivisions=5 if ridges_mm == 0 else 7)
     directions = np.asarray(ball.vertices)
     rng = np.random.default_rng(seed)
     radius = np.full(len(directions), 80.0)
@@ -24,6 +24,8 @@ def pebble(seed: int, roughness: float = 0.09) -> EmbreeCaster:
             axis = rng.normal(size=3)
             axis /= np.linalg.norm(axis)
             radius += 80 * roughness * share * np.sin(wavelength * directions @ axis * 2 + rng.uniform(0, 2 * np.pi))
+    # sharp above and round below, as hair is modelled: their two sides are not alike
+    radius += ridges_mm * (1.0 - np.abs(np.sin(16 * directions[:, 0] + 8 * directions[:, 1] + 2 * np.sin(5 * directions[:, 2]))))
     return EmbreeCaster(directions * radius[:, None], np.asarray(ball.faces))
 
 

@@ -41,6 +41,15 @@ def test_perturbed_scans_return_to_where_they_were_taken(views):
     assert result.residual_mm < 2 * np.hypot(0.1, 0.1)
 
 
+def test_ridges_that_smoothing_takes_off_do_not_lean_on_the_poses():
+    ridged = ring(pebble(1, ridges_mm=2.0), 6, noise_mm=0.02, elevations_deg=(-12.0, 38.0))
+    result = register(ridged)
+    assert result.verdict == "aligned"
+    # a hundredth of the sample spacing for noise, and as much again for what is left of the ridges
+    assert strays_mm(result.scans, ridged).max() < 0.02 * 1.6
+    assert max(s.pose_error_mm for s in result.states) < 0.1 * 1.6
+
+
 def test_scans_without_any_poses_are_put_together(views):
     result = register([scan.moved(rigid.identity()) for scan in views], guess="none")
     assert result.verdict == "aligned"

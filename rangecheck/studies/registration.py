@@ -70,6 +70,7 @@ def tried(scans: Sequence[RangeScan], truth: Sequence[RangeScan], guess: Guess, 
         "verdict": result.verdict, "aligned": len(known), "scans": len(truth), "seconds": seconds,
         "median_mm": float(np.median(known)) if len(known) else math.nan, "largest_mm": float(known.max(initial=0.0)),
         "silently_wrong": int((known > limit).sum()), "residual_mm": result.residual_mm,
+        "expected_mm": float(np.median([s.pose_error_mm for s in result.states if s.aligned] or [math.nan])),
     }  # fmt: skip
 
 
@@ -207,8 +208,8 @@ def bunny(quick: bool) -> Part:
 
 def _said(what: str, row: dict[str, Any]) -> str:
     return (
-        f"{what}: {row['verdict']}, {row['aligned']} of {row['scans']} scans, median error {row['median_mm']:.3f} mm, largest {row['largest_mm']:.3f}, "
-        f"{row['seconds']:.1f} s"
+        f"{what}: {row['verdict']}, {row['aligned']} of {row['scans']} scans, median error {row['median_mm']:.3f} mm, largest {row['largest_mm']:.3f} "
+        f"(expected: {row['expected_mm']:.3f}), {row['seconds']:.1f} s"
     )
 
 

@@ -26,6 +26,9 @@ _DAMPING = 1e-6
 LEAST_MATCHES = 12
 #: cells of the smallest smoothing window: readings within one err together
 WINDOW_CELLS = 25
+#: the same for points smoothed as little as noise allows: between white noise alone (2 to 4 cells) and ridges that residuals share; with it
+#: the sample bust's poses err by about what is expected
+FINE_WINDOW_CELLS = 12
 
 
 @dataclass(frozen=True)
@@ -167,7 +170,9 @@ def solve(
     return step
 
 
-def pose_errors_mm(samples: Sequence[Samples], poses: Sequence[FloatArray], fixed: int, count: int = 3000) -> list[float]:
+def pose_errors_mm(
+    samples: Sequence[Samples], poses: Sequence[FloatArray], fixed: int, count: int = 3000, window_cells: int = WINDOW_CELLS
+) -> list[float]:
     """Expected error of each pose relative to scan `fixed`: RMS displacement of the scan's points, one standard deviation.
 
     From the equations of all pairs at `poses`, each weighted by its own residual. Readings that share a smoothing window err
@@ -179,7 +184,7 @@ def pose_errors_mm(samples: Sequence[Samples], poses: Sequence[FloatArray], fixe
     found = gather(samples, poses, targets, moving, pairs, centre, length)
     information = np.zeros((6 * n, 6 * n))
     for (i, j), e in found.items():
-        shared = max(1.0, WINDOW_CELLS * len(moving[i][0]) / max(int(samples[i].inner.sum()), 1))
+        shared = max(1.0, window_cells * len(moving[i][0]) / max(int(samples[i].inner.sum()), 1))
         # both directions of a pair look at the same readings
         weighted = replace(e, normal=e.normal / (2 * shared * e.scale_mm**2))
         information += assemble({(i, j): weighted}, n)[0]

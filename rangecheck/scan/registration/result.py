@@ -97,6 +97,12 @@ class Registration:
                 f"{self.verdict}: {kept} of {n} scans aligned, residual {self.residual_mm:.3f} mm over "
                 f"{sum(p.accepted for p in self.pairs)} overlapping pairs"
             ]
+        errors = [s.pose_error_mm for s in self.states if s.aligned and math.isfinite(s.pose_error_mm)]
+        if len(errors) > 1:
+            lines.append(
+                f"poses are expected to err by {np.median(errors):.3f} mm in the median, {max(errors):.3f} at most (one standard deviation, from "
+                "noise and overlaps)"
+            )
         if self.turntable is not None:
             lines.append(self.turntable.line)
         for s in self.states:

@@ -25,7 +25,12 @@ JUMP_DEG = 82.0
 BORDER_CELLS = 2
 #: normals this uncertain (radians) or worse make the window grow
 _NORMAL_NOISE = 0.03
-_WINDOWS = (2, 3, 4, 5, 7)
+_WINDOWS = (1, 2, 3, 4, 5, 7)
+#: narrowest window that scans are compared through, cells to each side: coarse search and verdicts want quiet points
+_QUIET_WINDOW = 2
+#: what normals may err by in the end: by cos 0.1 they make a distance smaller by half a percent. Smoothing takes off more: what windows
+#: smooth away differs from view to view, and poses lean on it
+FINE_NORMAL_NOISE = 0.1
 #: points of one scan beyond which its grid is thinned: a pose needs no more
 ENOUGH_POINTS = 60_000
 _LEAST_POINTS = 50
@@ -73,8 +78,8 @@ class Samples:
         return self.points_mm.reshape(-1, 3)[chosen], self.normals.reshape(-1, 3)[chosen]
 
 
-def samples_of(scan: RangeScan, *, enough: int = ENOUGH_POINTS) -> Samples:
-    """`scan` made ready. Raises ScanError when fewer than 50 of its cells lie on a surface."""
+def samples_of(scan: RangeScan, *, enough: int = ENOUGH_POINTS, fine: bool = False) -> Samples:
+    """`scan` made ready; `fine`: smoothed as little as its normals allow, for the last step of an alignment. Raises ScanError when fewer than 50 of its cells lie on a surface."""
     scan.need_points(_LEAST_POINTS)
     stride = max(1, math.isqrt(int(scan.valid.sum() / enough)))
     points = np.ascontiguousarray(scan.grid_points_mm)
@@ -85,7 +90,8 @@ def samples_of(scan: RangeScan, *, enough: int = ENOUGH_POINTS) -> Samples:
             f"{scan.name}: no two neighbouring cells lie on one surface, so it has no normals; decode or filter it again",
             name=scan.name,
         )
-    for window in _WINDOWS:
+    most = FINE_NORMAL_NOISE if fine else _NORMAL_NOISE
+    for window in _WINDOWS if fine else [w for w in _WINDOWS if w >= _QUIET_WINDOW]:
         fits = _quadrics(points, rays, window, stride, step)
         usable = fits.usable
         found = int(usable.sum())
@@ -93,7 +99,7 @@ def samples_of(scan: RangeScan, *, enough: int = ENOUGH_POINTS) -> Samples:
             continue
         noise = float(np.sqrt(np.median(fits.variance[usable])))
         smooth, tilt = (noise * math.sqrt(float(np.median(v[usable]))) for v in (fits.spread, fits.tilt))
-        if tilt <= _NORMAL_NOISE and found >= 0.5 * int(scan.valid[::stride, ::stride].sum()):
+        if tilt <= most and found >= 0.5 * int(scan.valid[::stride, ::stride].sum()):
             break
     if int(usable.sum()) < _LEAST_POINTS:
         raise ScanError(

@@ -248,7 +248,7 @@ def from_coarse(place, field, state, coarse, least, first, last):
         for k in range(8):
             for j in range(8):
                 for i in range(8):
-                    if state[b, corner] != SEEN:
+                    if state[b, corner] < SEEN:
                         value = coarse_value(coarse, 8 * place[b, 0] + i, 8 * place[b, 1] + j, 8 * place[b, 2] + k)
                         field[b, corner] = max(value, least) if state[b, corner] == 1 else value
                     corner += 1

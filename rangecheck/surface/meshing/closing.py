@@ -33,7 +33,7 @@ def _relax(field, state, least, colour, first, last):
     for i in range(max(first, 1), min(last, nx - 1)):
         for j in range(1, ny - 1):
             for k in range(1 + (i + j + 1 + colour) % 2, nz - 1, 2):
-                if state[i, j, k] == 2:
+                if state[i, j, k] >= SEEN:
                     continue
                 mean = (
                     field[i - 1, j, k] + field[i + 1, j, k] + field[i, j - 1, k]
@@ -91,7 +91,7 @@ def coarse_field(
         values, known = np.ascontiguousarray(values), np.ascontiguousarray(known)
         if guess is not None:
             start = _finer(guess, values.shape)
-            values = np.where(known == SEEN, values, np.where(known == FREE, np.maximum(start, least), start)).astype(np.float32)
+            values = np.where(known >= SEEN, values, np.where(known == FREE, np.maximum(start, least), start)).astype(np.float32)
         _solve(values, known, least, SWEEPS)
         guess = values
     assert guess is not None
@@ -110,7 +110,7 @@ def _open_blocks(near, field, state, first, last, chosen):
                 row, other = find(near, b, i + (axis == 0), j + (axis == 1), k + (axis == 2))
                 if row < 0:
                     continue
-                if here != (field[row, other] < 0.0) and (state[b, corner] != SEEN or state[row, other] != SEEN):
+                if here != (field[row, other] < 0.0) and (state[b, corner] < SEEN or state[row, other] < SEEN):
                     chosen[b] = True
 
 
@@ -120,7 +120,7 @@ def _relax_blocks(near, field, state, rows, least, colour, first, last):
         b = rows[n]
         for corner in range(CORNERS):
             i, j, k = corner & 7, corner >> 3 & 7, corner >> 6
-            if state[b, corner] == 2 or (i + j + k) % 2 != colour:
+            if state[b, corner] >= SEEN or (i + j + k) % 2 != colour:
                 continue
             total = 0.0
             count = 0

@@ -18,7 +18,7 @@ from rangecheck.surface.meshing.tiles import BEFORE, BEHIND, Tiles, side_of_bloc
 from rangecheck.surface.meshing.views import Views
 
 #: what is known at a point
-UNKNOWN, FREE, SEEN = 0, 1, 2
+UNKNOWN, FREE, SEEN, CONTINUED = 0, 1, 2, 3
 BLOCK = 8
 CORNERS = BLOCK**3
 
@@ -27,15 +27,20 @@ CORNERS = BLOCK**3
 def look(cells, start, height, width, u, v, r):
     """(state, distance, weight, normal, variance, smoothed away) of one view at a point that projects to u, v with range r.
 
-    state: -1 nothing known, 0 free space reaches beyond every limit (the ray met nothing), 1 a surface at `distance` (signed)."""
+    state: -1 nothing known, 0 free space reaches beyond every limit (the ray met nothing), 1 a surface at `distance` (signed), 2 one that
+    is only continued beyond what was seen (`beyond`), which says nothing about the space before it."""
     state = -1
     distance = weight = nx = ny = nz = variance = smoothed = 0.0
-    if r > 0.0 and -0.5 < u < width - 0.5 and -0.5 < v < height - 0.5:
+    inside = r > 0.0 and -0.5 < u < width - 0.5 and -0.5 < v < height - 0.5
+    attempt = 1
+    while inside and attempt < 3:
         c0, r0 = math.floor(u), math.floor(v)
         s, t = u - c0, v - r0
         total = empty = value = cosine = 0.0
+        weight = nx = ny = nz = variance = smoothed = 0.0
         low, high = np.inf, -np.inf
         slope = 0.0
+        continued = False
         for k in range(4):
             dc, dr = k & 1, k >> 1
             col, row = c0 + dc, r0 + dr
@@ -47,13 +52,18 @@ def look(cells, start, height, width, u, v, r):
             if math.isinf(here):
                 empty += part
             elif here == here and part > 0.0:
+                heavy = abs(cells[cell, 3])
+                if cells[cell, 3] < 0.0:
+                    continued = True
+                    if attempt == 1:
+                        continue
                 lean = cells[cell, 1] * (u - col) + cells[cell, 2] * (v - row)
                 ahead = here + lean
                 low, high = min(low, ahead + lean), max(high, ahead + lean)
                 slope = max(slope, abs(cells[cell, 1]), abs(cells[cell, 2]))
                 total += part
                 value += part * ahead
-                weight += part * cells[cell, 3]
+                weight += part * heavy
                 nx += part * cells[cell, 4]
                 ny += part * cells[cell, 5]
                 nz += part * cells[cell, 6]
@@ -66,15 +76,16 @@ def look(cells, start, height, width, u, v, r):
             # the sign of a gap wider than this is certain even across a jump: the point lies before every surface
             if high - low > 0.5 + slope:
                 if r < low - 1.0:
-                    state, distance, weight = 1, low - r, 0.0
+                    state, distance, weight = attempt, low - r, 0.0
                 elif r > high + 1.0:
-                    state, distance, weight = 1, high - r, 0.0
+                    state, distance, weight = attempt, high - r, 0.0
             else:
-                state, distance = 1, (value - r) * cosine
+                state, distance = attempt, (value - r) * cosine
         elif empty > 0.999:
             state = 0
         elif total > 0.0 and total + empty > 0.999 and r < low - 1.0:
-            state, distance, weight = 1, low - r, 0.0
+            state, distance, weight = attempt, low - r, 0.0
+        attempt = attempt + 1 if continued and state < 0 else 3
     return state, distance, weight, nx, ny, nz, variance, smoothed
 
 
@@ -84,9 +95,11 @@ def _fill_blocks(
     origins, step, before_mm, behind_mm, first, last, field, state,
 ):  # fmt: skip
     total, weighted, free = np.empty(CORNERS), np.empty(CORNERS), np.empty(CORNERS)
+    seen = np.empty(CORNERS, np.bool_)
     for b in range(first, last):
         total[:] = 0.0
         weighted[:] = 0.0
+        seen[:] = False
         free[:] = 0.0
         for s in range(len(kind)):
             n = numbers[s]
@@ -110,16 +123,18 @@ def _fill_blocks(
                     known, d, w, _, _, _, _, _ = look(cells, start[s], size[s, 0], size[s, 1], u, v, r)
                     if known == 0 or (known == 1 and d > before_mm):
                         free[corner] += free_weight
-                    elif known == 1 and w > 0.0 and d >= -behind_mm:
+                    elif known > 0 and w > 0.0 and -behind_mm <= d <= before_mm:
                         # behind the surface the weight falls: what lies there may be another side of something thin
                         if d < -0.4 * behind_mm:
                             w *= (d + behind_mm) / (0.6 * behind_mm) + 1e-3
                         total[corner] += w
                         weighted[corner] += w * d
+                        seen[corner] |= known == 1
         for corner in range(CORNERS):
             sum_d = weighted[corner]
             if total[corner] > 0.0 and (sum_d >= 0.0 or sum_d + free[corner] * before_mm <= 0.0):
-                field[b, corner], state[b, corner] = sum_d / total[corner], SEEN
+                field[b, corner] = sum_d / total[corner]
+                state[b, corner] = SEEN if seen[corner] else CONTINUED
             elif free[corner] > 0.0:
                 field[b, corner], state[b, corner] = before_mm, FREE
             else:
@@ -131,7 +146,7 @@ def fill_blocks(
 ) -> tuple[FloatArray, IntArray]:
     """Field (n, 512) float32 and state (n, 512) uint8 at the corners of n blocks of 8 x 8 x 8, x fastest.
 
-    `before_mm`, `behind_mm`: how far before and behind a surface its distance counts. Free corners hold the one, unknown ones minus
+    A corner where views only continue surfaces beyond what they saw is CONTINUED. `before_mm`, `behind_mm`: how far before and behind a surface its distance counts. Free corners hold the one, unknown ones minus
     the other.
 
     Behind the rim of what a view sees its tangent planes run on into empty space: what they call inside is outside if the views

@@ -26,7 +26,7 @@ class Tiles:
     """start (s,) first tile of each scan, rows of tiles after each other; low, high (t,) nearest and farthest range in each tile;
     flattest (t,) least |ray . normal| in it.
 
-    An unknown cell makes `low` -inf and counts for nothing in `high`; one whose ray met nothing is at +inf in both."""
+    A cell that is unknown, or only continued, makes `low` -inf; an unknown one counts for nothing in `high`; one whose ray met nothing is at +inf in both."""
 
     start: IntArray
     low: FloatArray
@@ -41,7 +41,10 @@ def _fill(cells, first_cell, height, width, first_tile, low, high, flattest):
         for col in range(width):
             here = cells[first_cell + row * width + col, 0]
             tile = first_tile + (row // TILE) * across + col // TILE
-            if here == here:
+            if here < np.inf and cells[first_cell + row * width + col, 3] < 0.0:
+                low[tile], high[tile] = -np.inf, max(high[tile], here)
+                flattest[tile] = min(flattest[tile], cells[first_cell + row * width + col, 7])
+            elif here == here:
                 low[tile], high[tile] = min(low[tile], here), max(high[tile], here)
                 if here < np.inf:
                     flattest[tile] = min(flattest[tile], cells[first_cell + row * width + col, 7])

@@ -21,6 +21,7 @@ from rangecheck.errors import ScanError
 from rangecheck.kernels import in_chunks, kernel
 from rangecheck.optics import Camera, RayGrid
 from rangecheck.scan import RangeScan
+from rangecheck.surface.meshing.beyond import continue_cells
 from rangecheck.surface.meshing.edge_fit import BEND_TAN
 from rangecheck.surface.meshing.fit_error import CODES, STOPPED, middle_weights
 from rangecheck.surface.meshing.local_fit import quiet_ranges
@@ -241,13 +242,14 @@ def views_of(scans: Sequence[RangeScan]) -> Views:
     starts = np.cumsum([0, *(scan.need_points(16).range_mm.size for scan in scans)])
     cells, told = np.empty((starts[-1], FIELDS), np.float32), _Told.of(int(starts[-1]))
     known: dict[Camera, tuple[FloatArray, FloatArray]] = {}  # scans mostly share one camera
-    kinds, cameras, samples, own = [], [], [], []
+    kinds, cameras, pitches, samples, own = [], [], [], [], []
     for scan, start, stop in zip(scans, starts[:-1], starts[1:]):
         seen = projection_of(scan, known.get(scan.camera))
         known.clear()
         known[scan.camera] = seen.origins, seen.directions
         kinds.append(seen.kind)
         cameras.append(seen.numbers)
+        pitches.append(seen.pitch)
         samples.append(_points_of(scan, seen))
         own.append(start + np.flatnonzero(scan.valid))
         _fill_cells(scan, seen, cells, told, slice(int(start), int(stop)))
@@ -281,7 +283,9 @@ def views_of(scans: Sequence[RangeScan]) -> Views:
         hit = scans[first].valid.copy()
         _mark_hit(views.kind[first], views.numbers[first], *hit.shape, views.samples_mm, 2, hit)
         # a ray that returned nothing, and on which no other scan saw anything, ran through empty space
-        cells[starts[first] : starts[first + 1], RANGE][~_closed_up(hit).ravel()] = np.inf
+        mine = cells[starts[first] : starts[first + 1]]
+        mine[:, RANGE][~_closed_up(hit).ravel()] = np.inf
+        continue_cells(mine.reshape(*hit.shape, FIELDS), pitches[first])
 
     in_chunks(empty_space, len(scans), 1)
     return views
