@@ -3,8 +3,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= demo
-# what open3d's wheel needs from the system at import
-SYSTEM := libusb-1.0-0 libegl1 libgl1 libx11-6 libidn2-0 libgomp1
+# what the wheels of open3d and pymeshlab need from the system at import; and of mitsuba, which tests compare with
+SYSTEM := libusb-1.0-0 libegl1 libgl1 libx11-6 libidn2-0 libgomp1 libopengl0
+TEST_SYSTEM := libatomic1
 
 .PHONY: demo test lint sample clean
 
@@ -26,7 +27,7 @@ $(VENV)/.ready-demo: pyproject.toml .ci/system-packages | $(VENV)/bin/pip
 	touch $@
 
 $(VENV)/.ready-test: pyproject.toml .ci/system-packages | $(VENV)/bin/pip
-	.ci/system-packages $(SYSTEM)
+	.ci/system-packages $(SYSTEM) $(TEST_SYSTEM)
 	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[engines,formats,distributed,test,compare]'
 	touch $@ $(VENV)/.ready-demo
 

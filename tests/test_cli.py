@@ -215,3 +215,18 @@ def test_a_log_holds_what_was_done_and_how_it_ended(capsys, tmp_path):
     letter.write_text("Dear Ann,\n")
     assert "is no log" in complaint(capsys, "explain", "open-edges", "--log", letter)
     assert letter.read_text() == "Dear Ann,\n"
+
+
+def test_doctor_keeps_what_packages_print_off_its_document_and_names_the_libraries_they_lack(capfd, monkeypatch, tmp_path):
+    noisy = tmp_path / "pymeshlab.py"
+    noisy.write_text(
+        "import os\nprint('Unable to load the following plugins:')\n"
+        "os.write(1, b'libio_base.so: (libOpenGL.so.0: cannot open shared object file: No such file or directory)')\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "pymeshlab", raising=False)
+    exit_status(["doctor", "--json", "-q"])
+    sys.modules.pop("pymeshlab")
+    checks = {row["name"]: row for row in json.loads(capfd.readouterr().out)["checks"]}
+    assert checks["pymeshlab"]["state"] == "broken" and "libOpenGL.so.0" in checks["pymeshlab"]["detail"]
+    assert "libopengl0" in checks["pymeshlab"]["mend"]

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import importlib
 import importlib.metadata
+import io
 import os
 import platform
+import re
 import sys
 import tempfile
 from pathlib import Path
@@ -41,7 +45,11 @@ EXTRA = {
     "OpenEXR": "formats",
     "distributed": "distributed",
 }
-OPEN3D_SYSTEM = "apt-get install libusb-1.0-0 libegl1 libgl1 libx11-6 libidn2-0 libgomp1"
+#: what packages need of Debian beyond themselves
+SYSTEM = {
+    "open3d": "apt-get install libusb-1.0-0 libegl1 libgl1 libx11-6 libidn2-0 libgomp1",
+    "pymeshlab": "apt-get install libgl1 libegl1 libopengl0 libgomp1",
+}
 
 
 def doctor() -> Outcome:
@@ -61,10 +69,13 @@ def doctor() -> Outcome:
             row(module, "missing", purpose, install, needed)
             continue
         try:
-            importlib.import_module(module)
+            absent = _libraries_absent(_imported(module))
         except (ImportError, OSError) as error:
-            mend = OPEN3D_SYSTEM if module == "open3d" else f"{install} --force-reinstall"
+            mend = SYSTEM.get(module, f"{install} --force-reinstall")
             row(module, "broken", f"{version} does not load: {str(error).splitlines()[0]}", mend, needed)
+            continue
+        if absent:
+            row(module, "broken", f"{version} loads without parts that need {', '.join(absent)}", SYSTEM.get(module, ""), needed)
         else:
             row(module, "ok", f"{version}, {purpose}", needed=needed)
     _check_encoder(row)
@@ -82,6 +93,27 @@ def doctor() -> Outcome:
     ]
     lines.append("everything needed is here" if fit else "something that the main job needs is missing")
     return Outcome(document("doctor", version=__version__, fit=fit, checks=rows), lines, fit)
+
+
+def _imported(module: str) -> str:
+    """Imports, and returns what libraries inside it wrote to stdout, which is for documents: MeshLab complains there of plugins."""
+    everything = ctypes.CDLL(None)
+    kept = os.dup(1)
+    with tempfile.TemporaryFile() as said, contextlib.redirect_stdout(io.StringIO()):
+        os.dup2(said.fileno(), 1)
+        try:
+            importlib.import_module(module)
+        finally:
+            everything.fflush(None)
+            os.dup2(kept, 1)
+            os.close(kept)
+        said.seek(0)
+        return said.read().decode(errors="replace")
+
+
+def _libraries_absent(said: str) -> list[str]:
+    """Shared libraries that the loader did not find, each once."""
+    return sorted(set(re.findall(r"(lib\S+\.so\S*): cannot open shared object file", said)))
 
 
 def _check_encoder(row) -> None:
