@@ -193,9 +193,10 @@ def dent_part(quick: bool) -> Part:
                     {"shown": shown, "width_mm": 2 * width, "depth_mm": depth, "found_share": found, "times_asked": times_asked}
                 )
             half = [f"{1000 * depth:g}" for depth, t in zip(depths, middle) if t >= 1]
+            named = f"those of {', '.join(half)} µm are" if half else "none is"
             tried = ", ".join(f"{1000 * depth:g}" for depth in depths)
             findings.append(
-                f"{shown}, {2 * width:g} mm wide: of dents of {tried} µm those of {', '.join(half) or 'none'} µm are found at the median of {len(some)} places"
+                f"{shown}, {2 * width:g} mm wide: of dents of {tried} µm {named} found at the median of {len(some)} places"
             )
             lines.append(Line(f"{shown}, {2 * width:g} mm wide", depths, middle.tolist(), marked=True))
     lines.append(Line("asked", depths, [1.0] * len(depths)))
