@@ -177,7 +177,7 @@ def write_value_map(
         reach = reach or float(size.max(initial=0.0)) or 1.0
         subtitle = ""
         if size.max(initial=0.0) > reach:
-            subtitle = f"{span_text(*range_of(values))} {unit}; the colours end where {SHOWN:.0%} of the pixels do"
+            subtitle = f"{span_text(*range_of(values))} {unit}; the colours end where {100 * SHOWN:.0f} % of the pixels do"
         picture = coloured_map(values, title, unit, subtitle=subtitle, low=-reach, high=reach, colours="RdBu_r")
     else:
         picture = coloured_map(values, title, unit)

@@ -189,7 +189,7 @@ def _3mf(surface: Surface, lowered_mm: float | None = None) -> bytes:
     """A zip archive with one object; vertices keep the digits that tell their float64 values, and the item's transform makes it stand."""
     motion = np.eye(4) if lowered_mm is None else file_from_scans(lowered_mm)
     placed = "" if lowered_mm is None else f' transform="{" ".join(f"{x!r}" for x in motion[:3].T.ravel().tolist())}"'
-    shares = ", ".join(f"{name} {surface.share_of_area(k):.2%}" for k, name in enumerate(ORIGIN_NAMES))
+    shares = ", ".join(f"{name} {100 * surface.share_of_area(k):.2f} %" for k, name in enumerate(ORIGIN_NAMES))
     rows = [
         '<?xml version="1.0" encoding="UTF-8"?>',
         '<model unit="millimeter" xml:lang="en-US" xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02">',

@@ -159,7 +159,7 @@ def take(tracer: Tracer, optics: Optics, pose: FloatArray, plan: Plan, seed: int
     if plan.grey:
         made = replace(made.in_channels(channels), budget=film.budget)
     return made, [
-        f"defocus: traced in {share:.1%} of the pixels, where circles of confusion exceed {SHARP_PX:g} px; the widest has {widest:.3g}"
+        f"defocus: traced in {100 * share:.1f} % of the pixels, where circles of confusion exceed {SHARP_PX:g} px; the widest has {widest:.3g}"
     ]
 
 

@@ -150,7 +150,7 @@ class Standing:
         for spot in self.spots[:3]:
             x, y, z = spot.centre_mm
             said.append(
-                f"  a {'dent' if spot.depth_mm > 0 else 'bump'} at ({x:.1f}, {y:.1f}, {z:.1f}) mm, about {2 * spot.half_width_mm:g} mm wide and "
+                f"  a {'dent' if spot.depth_mm > 0 else 'bump'} at ({x:z.1f}, {y:z.1f}, {z:z.1f}) mm, about {2 * spot.half_width_mm:g} mm wide and "
                 f"{abs(spot.depth_mm):.2g} mm {'deep' if spot.depth_mm > 0 else 'high'}: {spot.ratio:.1f} times what is left around it "
                 f"({spot.asked:.1f} are asked)"
             )
@@ -254,18 +254,20 @@ def _lines(found: Consistency, speckle: Speckle | None, outlines: dict[str, Any]
     ]
     if speckle is not None:
         lines.append(
-            f"in mirrors: speckle {speckle.contrast:.1%} of the light; {speckle.pieces:.0f} pieces of highlight a frame, of which {speckle.jumps:.0%} are gone "
+            f"in mirrors: speckle {100 * speckle.contrast:.1f} % of the light; {speckle.pieces:.0f} pieces of highlight a frame, of which {100 * speckle.jumps:.0f} % are gone "
             "in the next"
         )
     if outlines:
         worst = max(outlines.items(), key=lambda item: item[1].worst_px)
         missing = max(o.missing_share for o in outlines.values())
         lines.append(
-            f"outlines: up to {missing:.2%} of a scan's cells show no surface; the worst lies {worst[1].worst_px:.1f} px off, in {worst[0]}"
+            f"outlines: up to {100 * missing:.2f} % of a scan's cells show no surface; the worst lies {worst[1].worst_px:.1f} px off, in {worst[0]}"
         )
     for place in found.places[:3]:
         x, y, z = place.centre_mm
-        lines.append(f"  stands out at ({x:.1f}, {y:.1f}, {z:.1f}) mm: {place.size_mm:.1f} mm wide, {place.peak_deg:.0f} degrees")
+        lines.append(
+            f"  stands out at ({x:z.1f}, {y:z.1f}, {z:z.1f}) mm: {place.size_mm:.1f} mm wide, {place.peak_deg:.0f} degrees"
+        )
     return lines
 
 

@@ -74,7 +74,7 @@ def _check_scans(file: str, settings: Settings, unit: str | None, reporter: Repo
             lines.append(f"  {a['name']}: {a['valid']:,} points without a grid; what they are worth cannot be told")
         else:
             lines.append(
-                f"  {a['name']}: {a['width']}x{a['height']}, {a['valid']:,} distances ({a['valid_share']:.0%}), "
+                f"  {a['name']}: {a['width']}x{a['height']}, {a['valid']:,} distances ({100 * a['valid_share']:.0f} %), "
                 f"{a['nearest_mm']:.1f} to {a['farthest_mm']:.1f} mm, spacing {a['spacing_mm'] or 0.0:.2f} mm"
             )
     from rangecheck.pipeline.explained import pictured

@@ -220,11 +220,11 @@ def _reasons(content: dict[str, Any]) -> list[str]:
     reasons = [f["message"] for f in found if f["severity"] == "error"]
     sentence = content["verdict"]["sentence"]
     reasons += [sentence] if not any(reason in sentence for reason in reasons) else []
-    reasons.append("of the surface, " + ", ".join(f"{share:.1%} is {name}" for name, share in shares.items()))
+    reasons.append("of the surface, " + ", ".join(f"{100 * share:.1f} % is {name}" for name, share in shares.items()))
     if quality:
         reasons.append(
             f"the scans are {quality['verdict']} for {quality['profile']['name']}: expected error {_length(quality['expected_error_mm'], 3)}, "
-            f"{quality['never_seen']:.1%} of the surface in reach never seen"
+            f"{100 * quality['never_seen']:.1f} % of the surface in reach never seen"
         )
     reasons.append(f"meshed by {content['method']}: {content['reason']}")
     return list(dict.fromkeys(reasons))[:3]
@@ -243,14 +243,14 @@ def _scan(folder: Path, facts: dict[str, Any], quality: dict[str, Any] | None) -
     if facts["camera"] is None:
         return Scan(name, [("Points", f"{facts['valid']:,}, a cloud without a grid")])
     rows = [
-        ("Readings", f"{facts['valid']:,} ({facts['valid_share']:.0%} of {facts['width']} × {facts['height']})"),
+        ("Readings", f"{facts['valid']:,} ({100 * facts['valid_share']:.0f} % of {facts['width']} × {facts['height']})"),
         ("Distances", f"{facts['nearest_mm']:.1f} to {facts['farthest_mm']:.1f} mm"),
         ("Spacing", _length(facts["spacing_mm"], 2)),
     ]
     view = next((v for v in (quality or {}).get("views", ()) if v["name"] == name), None)
     rows.append(("Noise", _length(facts["noise_mm"] if view is None else view["noise_mm"], 3)))
     if view is not None:
-        rows += [(label, f"{view[key]:.0%}") for label, key in _SHARES if view[key] is not None]
+        rows += [(label, f"{100 * view[key]:.0f} %") for label, key in _SHARES if view[key] is not None]
     pictures = [
         Figure(kind, "", read_bytes(path), alt=f"{kind} of {name}")
         for kind in ("Brightness", "Contours")
@@ -265,7 +265,7 @@ def _worth(quality: dict[str, Any] | None) -> list[tuple[str, str]]:
         return []
     return [
         ("Worth", f"{quality['verdict']} for {quality['profile']['name']}"),
-        ("Never seen", f"{quality['never_seen']:.1%} of the surface in reach, in {quality['gaps']} gaps"),
+        ("Never seen", f"{100 * quality['never_seen']:.1f} % of the surface in reach, in {quality['gaps']} gaps"),
         ("Readings apart", _length(quality["spacing_mm"], 2)),
         ("Expected error", _length(quality["expected_error_mm"], 3)),
     ]

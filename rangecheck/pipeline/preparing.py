@@ -207,8 +207,8 @@ def _worth(
 def _by_view(found: Any) -> list[str]:
     """A line for each scan."""
     return [
-        f"  {v.name}: spacing {v.spacing_mm:.2f} mm, noise {v.noise_mm:.3f} mm, {v.grazing:.0%} grazing"
-        + ("" if v.overlap != v.overlap else f", {v.overlap:.0%} confirmed by others")
+        f"  {v.name}: spacing {v.spacing_mm:.2f} mm, noise {v.noise_mm:.3f} mm, {100 * v.grazing:.0f} % grazing"
+        + ("" if v.overlap != v.overlap else f", {100 * v.overlap:.0f} % confirmed by others")
         for v in found.views
     ]
 

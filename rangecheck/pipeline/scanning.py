@@ -41,11 +41,11 @@ def mesh(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None
     lines = [
         f"{out}: {len(surface.faces):,} faces by {method} ({reason})",
         f"{'closed' if not open_edges else f'open: {open_edges} boundary edges'}; "
-        + ", ".join(f"{share:.1%} {name}" for name, share in shares.items()),
+        + ", ".join(f"{100 * share:.1f} % {name}" for name, share in shares.items()),
     ]
     if surface.refined_of_face is not None:
         lines.append(
-            f"{surface.refined_of_face.mean():.1%} of the faces refined by the shading of the brightness (property refined of a .ply)"
+            f"{100 * surface.refined_of_face.mean():.1f} % of the faces refined by the shading of the brightness (property refined of a .ply)"
         )
     return Outcome(
         document(

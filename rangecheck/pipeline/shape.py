@@ -129,7 +129,7 @@ def _cut(surface: Surface, wanted: Solidify, reporter: Reporter) -> Surface:
         raise SettingError("setting solid.cut has a normal of length 0; give nx, ny, nz, d", key="solid.cut")
     kept = trimmed(surface, height_mm=distance / length, up=normal, cap="cut")
     reporter.note(
-        f"cut by the plane {', '.join(f'{x:g}' for x in wanted.cut)}: {1 - kept.volume_mm3 / surface.volume_mm3:.1%} of the volume goes"
+        f"cut by the plane {', '.join(f'{x:g}' for x in wanted.cut)}: {100 * (1 - kept.volume_mm3 / surface.volume_mm3):.1f} % of the volume goes"
     )
     return kept
 
@@ -145,7 +145,7 @@ def _based(surface: Surface, wanted: Solidify, reporter: Reporter) -> Surface:
         before = surface.volume_mm3
         surface = hollow_back(surface, wall_mm=wanted.wall_mm)
         reporter.note(
-            f"back hollowed to a wall of {wanted.wall_mm:g} mm: {1 - surface.volume_mm3 / before:.1%} less resin, open behind"
+            f"back hollowed to a wall of {wanted.wall_mm:g} mm: {100 * (1 - surface.volume_mm3 / before):.1f} % less resin, open behind"
         )
     if wanted.base_height_mm is not None:
         height, reason = float(surface.bounds_mm[0, 1]) + wanted.base_height_mm, "asked for"
@@ -155,7 +155,9 @@ def _based(surface: Surface, wanted: Solidify, reporter: Reporter) -> Surface:
         chosen = choose_base_height(surface)
         height, reason = chosen.height_mm, chosen.reason
     cut = trimmed(surface, height_mm=height, up=UP)
-    reporter.note(f"base at {height:.1f} mm: {reason}; {1 - cut.volume_mm3 / surface.volume_mm3:.1%} of the volume goes")
+    reporter.note(
+        f"base at {height:.1f} mm: {reason}; {100 * (1 - cut.volume_mm3 / surface.volume_mm3):.1f} % of the volume goes"
+    )
     if wanted.base == "socle":
         from rangecheck.solid.socle import with_socle
 
@@ -305,7 +307,7 @@ def _story(made: Made) -> tuple[list[str], dict[str, Any]]:
         lines += [f"{'':<24} {'Original':>12} {'Final':>12}"]
         lines += [f"{name:<24} {before:>12,} {after:>12,}" for name, before, after in rows]
         lines += [
-            f"nothing outside filled places moved farther than {closed.moved_mm:.4f} mm; {closed.vanished:.3%} of the area is gone"
+            f"nothing outside filled places moved farther than {closed.moved_mm:.4f} mm; {100 * closed.vanished:.3f} % of the area is gone"
         ]
     if closed is not None:
         said["repair"] = {

@@ -265,7 +265,11 @@ def _noise_said(finder: RangeFinder) -> str:
 def _lost_said(reasons: dict[str, int]) -> str:
     met = sum(n for name, n in reasons.items() if name != "nothing there")
     lost = {name: n for name, n in reasons.items() if n and name not in ("measured", "nothing there")}
-    return "of the cells that meet the subject: " + ", ".join(f"{n / met:.1%} {name}" for name, n in lost.items()) if lost else ""
+    return (
+        "of the cells that meet the subject: " + ", ".join(f"{100 * n / met:.1f} % {name}" for name, n in lost.items())
+        if lost
+        else ""
+    )
 
 
 def _about(material: Material | None, finish: Finish | None, motion: Motion | None) -> str:

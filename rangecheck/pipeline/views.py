@@ -199,7 +199,7 @@ def _apart(found: SeenDeviation, name: str) -> list[str]:
         f"from {said['lowest_mm']:+.3g} to {said['highest_mm']:+.3g} mm (positive: outside it)"
     ]
     if found.faced < found.seen:
-        lines.append(f"nothing of {name} faces {1 - found.faced / found.seen:.1%} of what is seen: left out")
+        lines.append(f"nothing of {name} faces {100 * (1 - found.faced / found.seen):.1f} % of what is seen: left out")
     return lines
 
 

@@ -320,7 +320,7 @@ def _next_view(allowed: FloatArray, space: Space, up: FloatArray) -> NextView | 
     where = np.average(likely.centres_mm(shell.index[adds]), axis=0, weights=shell.area_mm2[adds])
     reason = (
         f"from azimuth {azimuth:.0f}, elevation {elevation:.0f} degrees it sees {gain[k] / 100:.1f} cm2 (foreshortened) of the "
-        f"{unseen / 100:.1f} cm2 that may be expected where no scan has seen anything, around ({', '.join(f'{x:.0f}' for x in where)}) mm; "
+        f"{unseen / 100:.1f} cm2 that may be expected where no scan has seen anything, around ({', '.join(f'{x:z.0f}' for x in where)}) mm; "
         f"{100 * overlap[k]:.0f} % of its picture is known already"
     )
     return NextView(tuple(allowed[k].tolist()), azimuth, elevation, float(gain[k]), float(overlap[k]), reason)
@@ -335,11 +335,11 @@ def _findings(views, wanted: Profile, scale, seen, unseen, spacing, error, step,
         if worse:
             found.append(Finding(code, "error" if far else "warning", text, value, limit, scan))
 
-    largest = f", the largest around ({', '.join(f'{x:.0f}' for x in gaps[0].centre_mm)}) mm" if gaps else ""
+    largest = f", the largest around ({', '.join(f'{x:z.0f}' for x in gaps[0].centre_mm)}) mm" if gaps else ""
     # what a single scan cannot see is no fault of it: never more than a warning
     add("scan-unseen", 1 - seen, wanted.most_unseen, 4 * wanted.most_unseen if len(views) > 1 else 1.0,
-        f"{100 * (1 - seen):.1f} % of the surface in reach ({unseen / 100:.0f} cm2) was never seen, in {len(gaps)} gaps{largest} "
-        f"(at most {100 * wanted.most_unseen:.0f} %); "
+        f"{100 * (1 - seen):.1f} % of the surface in reach ({unseen / 100:.0f} cm2) was never seen (at most {100 * wanted.most_unseen:.0f} %), "
+        f"in {len(gaps)} gaps{largest}; "
         + ("one scan makes a relief, and a bust takes more" if len(views) == 1 else "scan again from the next view"))  # fmt: skip
     height = wanted.height_mm / scale
     if not LIKELY_MM[0] <= height <= LIKELY_MM[1]:

@@ -34,7 +34,7 @@ def cut_flat(solid: Solid | Surface, *, height_mm: float, up: npt.ArrayLike = UP
     whole, notes = (solid.surface, solid.notes) if isinstance(solid, Solid) else (solid, ())
     surface = trimmed(whole, height_mm=height_mm, up=up)
     removed = 1 - surface.volume_mm3 / whole.volume_mm3
-    note = f"cut flat at {height_mm:.3f} mm: {removed:.2%} of the volume went"
+    note = f"cut flat at {height_mm:.3f} mm: {100 * removed:.2f} % of the volume went"
     return Solid.from_surface(surface, notes=(*notes, note))
 
 
@@ -86,7 +86,7 @@ def choose_base_height(solid: Solid | Surface, *, up: npt.ArrayLike = UP, most_r
         reason = f"above {low + step / 200 * tall:.1f} mm less than half of the surface is invented"
     else:
         step = limit
-        reason = f"invented surface reaches above {most_removed:.0%} of the height; no more is given up"
+        reason = f"invented surface reaches above {100 * most_removed:.0f} % of the height; no more is given up"
     height = low + max(step, 1) / 200 * tall
     return BaseHeight(float(height), reason)
 

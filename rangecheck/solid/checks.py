@@ -169,7 +169,7 @@ def _crumbs(surface: Surface, shell: IntArray, sizes: FloatArray, what: str, sev
     small = sizes < NOISE_SHARE * sizes.max()
     if not small.any():
         return []
-    message = f"{int(small.sum())} of {len(sizes)} shells have less than {NOISE_SHARE:.0%} of the largest one's {what}"
+    message = f"{int(small.sum())} of {len(sizes)} shells have less than {100 * NOISE_SHARE:.0f} % of the largest one's {what}"
     middles = _shell_middles(surface, shell, np.flatnonzero(small))
     return [finding("noise-shells", int(small.sum()), message, middles, np.flatnonzero(small[shell]), severities)]
 

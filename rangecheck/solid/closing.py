@@ -58,7 +58,7 @@ def close_surface(
     longest = LONGEST_LEASH * surface.extent_mm
     allowed = min(max_move_mm, longest)
     short = (
-        f"the leash is {allowed:.3g} mm, {LONGEST_LEASH:.1%} of the part, and not {max_move_mm:g} mm"
+        f"the leash is {allowed:.3g} mm, {100 * LONGEST_LEASH:.1f} % of the part, and not {max_move_mm:g} mm"
         if allowed < max_move_mm
         else ""
     )
@@ -93,8 +93,8 @@ def choose_way(surface: Surface, *, one_scan: bool = False) -> tuple[str, str]:
         return "relief", "it was seen from one place"
     share = float(np.linalg.norm(surface.area_vectors.sum(axis=0)) / max(surface.area_mm2, 1e-300))
     if share > ONE_WAY:
-        return "relief", f"it faces one way: its area vectors add up to {share:.0%} of its area"
-    return "repair", f"it faces all ways: its area vectors add up to {share:.0%} of its area"
+        return "relief", f"it faces one way: its area vectors add up to {100 * share:.0f} % of its area"
+    return "repair", f"it faces all ways: its area vectors add up to {100 * share:.0f} % of its area"
 
 
 def _as_relief(surface: Surface, back_mm: float, eye_mm: npt.ArrayLike | None, reason: str) -> Closed:

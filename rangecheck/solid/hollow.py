@@ -100,14 +100,14 @@ class Hollow:
         w = self.wall
         lines = [
             f"wall asked {w.asked_mm:g} mm; measured from the cavity {w.least_mm:.3f} to {w.largest_mm:.3f} mm, median {w.median_mm:.3f}, "
-            f"within {w.tolerance_mm:g} mm over {w.share_within:.2%} of its area; from outside over {w.outer_within:.2%} of what leaves room for "
-            f"it; {w.full_share:.1%} is proved too sharp or too thin for a cavity and stays thicker",
+            f"within {w.tolerance_mm:g} mm over {100 * w.share_within:.2f} % of its area; from outside over {100 * w.outer_within:.2f} % of what leaves room for "
+            f"it; {100 * w.full_share:.1f} % is proved too sharp or too thin for a cavity and stays thicker",
         ]
         if w.full:
-            listed = ", ".join(f"({x:.1f}, {y:.1f}, {z:.1f}) {d:.1f} mm" for x, y, z, d in w.full[:6])
+            listed = ", ".join(f"({x:z.1f}, {y:z.1f}, {z:z.1f}) {d:.1f} mm" for x, y, z, d in w.full[:6])
             lines.append(f"thicker where the shape leaves no room for a cavity: {listed}")
         lines += [
-            f"drain of {d.diameter_mm:g} mm from ({', '.join(f'{x:.1f}' for x in d.inside_mm)}) to ({', '.join(f'{x:.1f}' for x in d.outside_mm)}) mm"
+            f"drain of {d.diameter_mm:g} mm from ({', '.join(f'{x:z.1f}' for x in d.inside_mm)}) to ({', '.join(f'{x:z.1f}' for x in d.outside_mm)}) mm"
             for d in self.drains
         ]
         tilt = ", ".join(f"{x:g}" for x in self.up)
@@ -115,7 +115,7 @@ class Hollow:
             lines.append(f"proved to drain with ({tilt}) up: from every cell of the cavity a way leads out that never rises")
         lines += [
             f"keeps {p.volume_mm3:.1f} mm3 with ({tilt}) up, {'closed for ever' if p.closed else f'{p.depth_mm:.1f} mm deep'}, lowest at "
-            f"({', '.join(f'{x:.1f}' for x in p.lowest_mm)}) mm"
+            f"({', '.join(f'{x:z.1f}' for x in p.lowest_mm)}) mm"
             for p in self.kept
         ]
         return lines

@@ -64,9 +64,7 @@ def _fits(local: FloatArray, printer: Printer, facts: dict[str, Any], severities
         return []
     scale = min(bed[0] / wide, bed[1] / deep, printer.build_mm[2] / tall)
     x, y, z = printer.build_mm
-    message = (
-        f"{wide:.1f} x {deep:.1f} x {tall:.1f} mm does not fit {x:g} x {y:g} x {z:g} mm; at {scale:.1%} of its size it would"
-    )
+    message = f"{wide:.1f} x {deep:.1f} x {tall:.1f} mm does not fit {x:g} x {y:g} x {z:g} mm; at {100 * scale:.1f} % of its size it would"
     return [finding("does-not-fit", 1, message, severities=severities, fits_at=scale)]
 
 

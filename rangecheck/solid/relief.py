@@ -142,13 +142,13 @@ def _visible(surface: Surface, uv: FloatArray, depth: FloatArray, notes: list[st
     gone = 1.0 - float(surface.face_areas[facing[~hidden]].sum()) / total
     if gone > 0.25:
         raise SurfaceError(
-            f"{gone:.0%} of the surface is turned away or hidden, so it is no relief from there; give eye_mm, the place that the scan "
+            f"{100 * gone:.0f} % of the surface is turned away or hidden, so it is no relief from there; give eye_mm, the place that the scan "
             "was taken from, or mesh several views together",
             hidden_share=gone,
         )
     if len(facing) < len(surface.faces) or hidden.any():
         notes.append(
-            f"{len(surface.faces) - len(facing)} faces turned away and {int(hidden.sum())} hidden ones were left out ({gone:.2%} of the area)"
+            f"{len(surface.faces) - len(facing)} faces turned away and {int(hidden.sum())} hidden ones were left out ({100 * gone:.2f} % of the area)"
         )
     return facing[~hidden]
 
@@ -177,7 +177,7 @@ def _without_islands(surface: Surface, kept: IntArray, uv: FloatArray, share: fl
     areas = np.bincount(shell, _plane_areas(uv, surface.faces[kept]), minlength=count)
     small = areas < share * areas.max()
     if small.any():
-        notes.append(f"{int(small.sum())} islands with {areas[small].sum() / areas.sum():.2%} of the area were dropped")
+        notes.append(f"{int(small.sum())} islands with {100 * areas[small].sum() / areas.sum():.2f} % of the area were dropped")
     return kept[~small[shell]]
 
 
@@ -194,7 +194,7 @@ def _one_disc(
         doomed = shell != int(np.argmax(areas))
         if doomed.any():
             notes.append(
-                f"{count - 1} pieces beyond gaps of {gap_mm:.2f} mm, {1 - areas.max() / areas.sum():.2%} of the area, were dropped"
+                f"{count - 1} pieces beyond gaps of {gap_mm:.2f} mm, {100 * (1 - areas.max() / areas.sum()):.2f} % of the area, were dropped"
             )
         else:
             doomed = _smaller_fans(flat, _plane_areas(uv, whole))

@@ -155,10 +155,12 @@ def _without_crumbs(surface: Surface, max_vanished: float, steps: list[Step], re
         return surface
     if share > max_vanished:
         refused.append(
-            f"{int(small.sum())} crumbs hold {share:.2%} of the area, more than the {max_vanished:.2%} that may vanish"
+            f"{int(small.sum())} crumbs hold {100 * share:.2f} % of the area, more than the {100 * max_vanished:.2f} % that may vanish"
         )
         return surface
-    steps.append(Step("drop-crumbs", int(small.sum()), f"{int(small.sum())} crumbs with {share:.3%} of the area were dropped"))
+    steps.append(
+        Step("drop-crumbs", int(small.sum()), f"{int(small.sum())} crumbs with {100 * share:.3f} % of the area were dropped")
+    )
     return surface.with_faces(~small[shell])
 
 
@@ -259,7 +261,11 @@ def _untangled(surface: Surface, max_move_mm: float, max_vanished: float, steps:
         if again is not None:
             result, share = again
             steps.append(
-                Step("cut-out", loose.after, f"{loose.after} pairs of faces cut out with {share:.3%} of the area and filled anew")
+                Step(
+                    "cut-out",
+                    loose.after,
+                    f"{loose.after} pairs of faces cut out with {100 * share:.3f} % of the area and filled anew",
+                )
             )
             return result
     refused.append(f"{loose.after} pairs of faces that meet neither come loose within {max_move_mm:g} mm nor can be cut out")

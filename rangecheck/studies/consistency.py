@@ -48,10 +48,10 @@ def _slopes_part(quick: bool) -> Part:
         rows.append({"planted_deg": planted, "measured_deg": found.slope_noise_deg, "share": found.slope_noise_deg / planted - 1})
     worst = max(abs(float(row["share"])) for row in rows)
     findings = [
-        f"slope noise planted {row['planted_deg']:g} degrees, measured {row['measured_deg']:.3f} ({row['share']:+.1%})"
+        f"slope noise planted {row['planted_deg']:g} degrees, measured {row['measured_deg']:.3f} ({100 * row['share']:+.1f} %)"
         for row in rows
     ]
-    findings.append(f"slope noise is measured within {worst:.1%} (bar {_SHARE:.0%})")
+    findings.append(f"slope noise is measured within {100 * worst:.1f} % (bar {100 * _SHARE:.0f} %)")
     lines = [Line("measured", PLANTED_DEG, measured, marked=True), Line("planted", PLANTED_DEG, PLANTED_DEG)]
     chart = LineChart(
         "slopes",

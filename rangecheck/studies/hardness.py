@@ -109,8 +109,8 @@ def _memory_part(quick: bool) -> Part:
     settled, last = held[SETTLED - 1], held[-1]
     growth = last / settled - 1
     finding = (
-        f"{subjects} subjects in one process: {settled:.0f} MB after subject {SETTLED}, {last:.0f} MB after the last, {growth:+.1%} "
-        f"(at most {ALLOWED_GROWTH:.0%}: {'kept' if growth <= ALLOWED_GROWTH else 'missed'}); the most after any {max(held):.0f} MB"
+        f"{subjects} subjects in one process: {settled:.0f} MB after subject {SETTLED}, {last:.0f} MB after the last, {100 * growth:+.1f} % "
+        f"(at most {100 * ALLOWED_GROWTH:.0f} %: {'kept' if growth <= ALLOWED_GROWTH else 'missed'}); the most after any {max(held):.0f} MB"
     )
     return Part(findings=[finding], tables={"memory": [{"subject": k + 1, "held_mb": mb} for k, mb in enumerate(held)]})
 

@@ -204,7 +204,7 @@ def full_disk_part(quick: bool, which: str) -> Part:
                 rows.append(
                     {"command": name, "share": share, "status": ended.status, "said": ended.complaint[-300:], "wrong": wrong}
                 )
-                bad += [f"{name} with room for {share:.0%} of {enough.wrote_kib} KiB: {one}" for one in wrong]
+                bad += [f"{name} with room for {100 * share:.0f} % of {enough.wrote_kib} KiB: {one}" for one in wrong]
                 shutil.rmtree(place)
             findings.append(
                 f"{name}: {len(shares)} full disks, {'each answered in one line, nothing half-written' if not bad else 'NOT answered well:'}"

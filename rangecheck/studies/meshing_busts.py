@@ -57,7 +57,7 @@ def busts(quick: bool) -> Part:
             rows += measured(subject, truth, noise, 128 if quick else 320, ["fuse"] if quick else list(METHODS))
     fused = [r for r in rows if r["method"] == "fuse"]
     findings = [
-        f"{r['bust']}, noise {r['noise_mm']:g} mm: fuse {r['rms_mm']:.4f} mm RMS; {r['within_one']:.1%} within one expected error, {r['within_two']:.1%} within two"
+        f"{r['bust']}, noise {r['noise_mm']:g} mm: fuse {r['rms_mm']:.4f} mm RMS; {100 * r['within_one']:.1f} % within one expected error, {100 * r['within_two']:.1f} % within two"
         for r in fused
     ]
     others = [r for r in rows if r["method"] != "fuse"]

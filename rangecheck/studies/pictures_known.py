@@ -167,7 +167,7 @@ def maps_part(quick: bool) -> Part:
     chains = [_corner((160.0, 140.0, 170.0), size), _corner((300.0, 60.0, 90.0), size), _ball((60.0, 120.0, 260.0), size)]
     findings += [
         f"{row['scene']}: {row['right_away']:,} of {row['away']:,} pixels away from edges have exactly the analytic IDs; of all "
-        f"{row['right'] / row['pixels']:.3%}"
+        f"{100 * row['right'] / row['pixels']:.3f} %"
         for row in chains
     ]
     findings.append(_booleans())

@@ -81,7 +81,7 @@ def cameras_part(quick: bool) -> Part:
         trips.append({"camera": name, "largest_px": back, "share_with_ray": known})
         findings.append(
             f"distortion, {name}: pixels come back to within {back:.1e} px (bar {ROUND_TRIP_PX:g}: {_kept(back <= ROUND_TRIP_PX)}); "
-            f"{known:.1%} of the frame has rays"
+            f"{100 * known:.1f} % of the frame has rays"
         )
     camera = PinholeCamera.from_field_of_view(101, 101, 20)
     for depth in (400.0, 800.0, 1000.0, 1500.0):
@@ -90,8 +90,8 @@ def cameras_part(quick: bool) -> Part:
         discs.append({"depth_mm": depth, "measured_px": measured, "formula_px": formula, "share": measured / formula - 1})
     worst = max(abs(float(row["share"])) for row in discs)
     findings.append(
-        f"defocus: discs of {discs[0]['formula_px']:.1f} to {discs[-1]['formula_px']:.1f} px at four depths are the thin lens's within {worst:.2%} "
-        f"(bar {DISC_SHARE:.0%}: {_kept(worst <= DISC_SHARE)})"
+        f"defocus: discs of {discs[0]['formula_px']:.1f} to {discs[-1]['formula_px']:.1f} px at four depths are the thin lens's within {100 * worst:.2f} % "
+        f"(bar {100 * DISC_SHARE:.0f} %: {_kept(worst <= DISC_SHARE)})"
     )
     wide = ThinLens(PinholeCamera.from_field_of_view(901, 3, 80), aperture_mm=0.5, focus_mm=1e9)
     factor, middle = wide.irradiance_factor()[1], 450

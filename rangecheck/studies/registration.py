@@ -139,11 +139,11 @@ def overlap(quick: bool) -> Part:
         lines,
         log="y",
     )
-    findings = [_said(f"{r['angle_deg']:g} degrees apart, {r['overlap']:.0%} in common", r) for r in rows]
+    findings = [_said(f"{r['angle_deg']:g} degrees apart, {100 * r['overlap']:.0f} % in common", r) for r in rows]
     words = (
         "never"
         if edge.breaks_at is None
-        else f"at {edge.breaks_at:.0f} degrees, {_shared(_two(edge.breaks_at, width)):.0%} in common"
+        else f"at {edge.breaks_at:.0f} degrees, {100 * _shared(_two(edge.breaks_at, width)):.0f} % in common"
     )
     return Part([chart], [*findings, f"two views are no longer aligned: {words}", _silence(rows)], {"overlap": rows})
 

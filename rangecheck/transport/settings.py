@@ -115,4 +115,5 @@ class Plan:
 
     def explain(self) -> list[str]:
         """The decisions, one line each, for people."""
-        return [f"model {self.model}, tolerance {100 * self.tolerance:g} % of the mean radiance", *self.reasons]
+        promised = f", tolerance {100 * self.tolerance:g} % of the mean radiance" if self.tolerance else ""
+        return [f"model {self.model}{promised}", *self.reasons]

@@ -50,8 +50,8 @@ class Turntable:
     def line(self) -> str:
         """The turntable in a sentence."""
         return (
-            f"turntable: steps of {self.step_deg:+.2f} degrees about ({', '.join(f'{x:.3f}' for x in self.direction)}) through "
-            f"({', '.join(f'{x:.1f}' for x in self.point_mm)}) mm; the scans depart from it by {self.departure_mm:.3f} mm (RMS)"
+            f"turntable: steps of {self.step_deg:+.2f} degrees about ({', '.join(f'{x:z.3f}' for x in self.direction)}) through "
+            f"({', '.join(f'{x:z.1f}' for x in self.point_mm)}) mm; the scans depart from it by {self.departure_mm:.3f} mm (RMS)"
         )
 
     def poses(self, world_from_first: FloatArray) -> list[FloatArray]:
