@@ -121,6 +121,13 @@ def about_axis(axis: npt.ArrayLike, angle_rad: float) -> FloatArray:
     return motion
 
 
+def across(directions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Two unit vectors across each unit vector of `directions` (..., 3): one across the axis least along it too, and direction x one."""
+    one = np.cross(directions, np.eye(3)[np.abs(directions).argmin(axis=-1)])
+    one /= np.linalg.norm(one, axis=-1, keepdims=True)
+    return one, np.cross(directions, one)
+
+
 def look_at(eye_mm: npt.ArrayLike, target_mm: npt.ArrayLike, up: npt.ArrayLike = (0.0, 1.0, 0.0)) -> FloatArray:
     """world_from_camera of a camera at `eye_mm` that looks at `target_mm`: x right, y down, z forward (OpenCV's axes).
 
@@ -133,7 +140,7 @@ def look_at(eye_mm: npt.ArrayLike, target_mm: npt.ArrayLike, up: npt.ArrayLike =
     forward = forward / distance
     right = np.cross(forward, require("up", up, (3,), finite=True))
     if np.linalg.norm(right) < 1e-9:
-        right = np.cross(forward, np.eye(3)[np.argmin(np.abs(forward))])
+        right, _ = across(forward)
     right /= np.linalg.norm(right)
     motion = np.eye(4)
     motion[:3, 0], motion[:3, 1], motion[:3, 2], motion[:3, 3] = right, np.cross(forward, right), forward, eye

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rangecheck import arrays, errors, files, kernels, progress, rigid
+from rangecheck.basis import frame_around
 from rangecheck.config import load_settings
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -122,7 +123,7 @@ def test_every_package_folder_is_listed_for_the_wheel():
 def test_a_compiled_kernel_is_keyed_by_the_sources_of_what_it_imports():
     package = Path(kernels.__file__).parent
     names = {str(Path(path).relative_to(package)) for path in kernels.sources_of(package / "transport" / "scatter.py")}
-    assert {"transport/scatter.py", "transport/geometry.py", "reflectance/fast.py", "reflectance/octaves.py"} <= names
+    assert {"transport/scatter.py", "basis.py", "reflectance/fast.py", "reflectance/octaves.py"} <= names
     assert not names & {"pipeline/job.py", "surface/surface.py"}
 
 
@@ -168,3 +169,17 @@ def test_parts_that_a_killed_process_left_are_swept_up_and_nothing_else(tmp_path
     files.sweep_parts(tmp_path)
     assert not survivor.exists()
     assert all(path.exists() for path in [*kept, below / "c.png"])
+
+
+@pytest.mark.parametrize(
+    "frames", [rigid.across, lambda z: np.array([frame_around(*n) for n in z]).reshape(-1, 2, 3).swapaxes(0, 1)]
+)
+def test_two_directions_across_a_third_make_a_right_handed_frame_with_it(frames):
+    rng = np.random.default_rng(3)
+    z = np.concatenate([np.eye(3), -np.eye(3), arrays.unit_vectors(rng.normal(size=(200, 3)))])
+    u, v = frames(z)
+    some_roundings = 16 * np.finfo(float).eps
+    assert np.abs(np.linalg.det(np.stack([u, v, z], axis=1)) - 1.0).max() < some_roundings
+    assert (
+        np.abs(np.einsum("kni,lni->kln", np.stack([u, v, z]), np.stack([u, v, z])) - np.eye(3)[..., None]).max() < some_roundings
+    )

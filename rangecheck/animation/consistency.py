@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rangecheck.arrays import BoolArray, FloatArray, IntArray
+from rangecheck.basis import frame_around
 from rangecheck.errors import SurfaceError
 from rangecheck.kernels import in_chunks, kernel, thread_count
 from rangecheck.maps import Maps, trace_maps
@@ -186,12 +187,7 @@ def _residuals(normals, middles, part, near, judged, alike, slope, height):
             continue
         length = math.sqrt(mx * mx + my * my + mz * mz)
         mx, my, mz = mx / length, my / length, mz / length
-        # Duff and others, Building an orthonormal basis, revisited, 2017
-        sign = 1.0 if mz >= 0.0 else -1.0
-        c = -1.0 / (sign + mz)
-        d = mx * my * c
-        ux, uy, uz = 1.0 + sign * mx * mx * c, sign * d, -sign * mx
-        vx, vy, vz = d, sign + my * my * c, -my
+        ux, uy, uz, vx, vy, vz = frame_around(mx, my, mz)
         spread = 0.0
         for k in range(count):
             j = near[i, k]

@@ -14,6 +14,7 @@ import math
 
 import numpy as np
 
+from rangecheck.basis import frame_around
 from rangecheck.kernels import inline_kernel, kernel
 
 #: of the polynomial that holds the smooth form
@@ -139,12 +140,7 @@ def matched(points, normals, noise, weight, first, begins, who, reach, half_widt
         if length == 0.0:
             continue
         mx, my, mz = mx / length, my / length, mz / length
-        # Duff and others, Building an orthonormal basis, revisited, 2017
-        sign = 1.0 if mz >= 0.0 else -1.0
-        c = -1.0 / (sign + mz)
-        d = mx * my * c
-        ux, uy, uz = 1.0 + sign * mx * mx * c, sign * d, -sign * mx
-        vx, vy, vz = d, sign + my * my * c, -my
+        ux, uy, uz, vx, vy, vz = frame_around(mx, my, mz)
         plain[:], dented[:], told_u[:], told_v[:], ends[:], sector[:] = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         count, nuu, nuv, nvv = 0, 0.0, 0.0, 0.0
         for t in range(begins[s], begins[s + 1]):

@@ -22,6 +22,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from rangecheck import rigid
 from rangecheck.arrays import BoolArray, FloatArray, IntArray
 from rangecheck.maps import Maps, trace_maps, trace_shadows
 from rangecheck.maps.shadow import LIT
@@ -198,7 +199,7 @@ class _Gathered:
         known = np.flatnonzero(self._pixels > 0)
         matrix, right, normals = _whole(self._matrix[known]), self._right[known], start[known]
         for _ in range(_STEPS):
-            across = np.stack(_tangents(normals), axis=2)
+            across = np.stack(rigid.across(normals), axis=2)
             curved = np.einsum("kia,kij,kjb->kab", across, matrix, across)
             curved[:, [0, 1], [0, 1]] += 1e-6 / _WORST_RAD**2
             slope = np.einsum("kia,ki->ka", across, right - np.einsum("kij,kj->ki", matrix, normals))
@@ -219,11 +220,6 @@ def _whole(sums: FloatArray) -> FloatArray:
 
 def _unit(vectors: FloatArray) -> FloatArray:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
-
-
-def _tangents(normals: FloatArray) -> tuple[FloatArray, FloatArray]:
-    u = _unit(np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=1)]))
-    return u, np.cross(normals, u)
 
 
 def _judged(surface: Surface, camera: PinholeCamera, pose: FloatArray, caster: Caster) -> tuple[Maps, BoolArray]:

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rangecheck.arrays import FloatArray, require
+from rangecheck.basis import frame_around
 from rangecheck.errors import SceneError
 from rangecheck.scene import Source
 
@@ -92,11 +93,8 @@ class Light:
 
 
 def tangents(z: FloatArray) -> FloatArray:
-    """(2, 3) unit vectors across the unit vector z (Duff et al. 2017)."""
-    sign = 1.0 if z[2] >= 0.0 else -1.0
-    a = -1.0 / (sign + z[2])
-    b = z[0] * z[1] * a
-    return np.array([[1.0 + sign * z[0] ** 2 * a, sign * b, -sign * z[0]], [b, sign + z[1] ** 2 * a, -z[1]]])
+    """(2, 3) unit vectors across the unit vector z."""
+    return np.array(frame_around(*z)).reshape(2, 3)
 
 
 def tangent_slopes(z: FloatArray) -> FloatArray:

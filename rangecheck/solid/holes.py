@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rangecheck import rigid
 from rangecheck.arrays import FloatArray, IntArray
 from rangecheck.solid.engine import triangulate
 from rangecheck.surface import topology as topo
@@ -137,9 +138,7 @@ def _patch(surface: Surface, ring: IntArray, known: set[int]) -> tuple[FloatArra
     if len(ring) < 3 or length == 0.0:
         return None
     normal /= length
-    right = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-    right /= np.linalg.norm(right)
-    flat = np.stack([(rim - centre) @ right, (rim - centre) @ np.cross(normal, right)], axis=1)
+    flat = (rim - centre) @ np.stack(rigid.across(normal), axis=1)
     faces = triangulate([flat]) if not _crosses_itself(flat) else least_area_triangles(rim)
     if faces is None or not len(faces):
         return None

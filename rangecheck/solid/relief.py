@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from rangecheck import rigid
 from rangecheck.arrays import BoolArray, FloatArray, IntArray, require
 from rangecheck.errors import SurfaceError
 from rangecheck.kernels import kernel
@@ -71,12 +72,11 @@ def view_of(surface: Surface, eye_mm: npt.ArrayLike | None = None) -> View:
         eye = require("eye_mm", eye_mm, (3,), finite=True)
         forward = surface.vertices[_used(surface.vertices, surface.faces)].mean(axis=0) - eye
         forward = forward / np.linalg.norm(forward)
-    right = np.cross(forward, np.eye(3)[np.argmin(np.abs(forward))])
-    right /= np.linalg.norm(right)
+    right, down = rigid.across(forward)
     depth = (surface.vertices - eye) @ forward
     if eye_mm is not None and depth[_used(surface.vertices, surface.faces)].min() <= 0:
         raise SurfaceError("part of the surface lies behind the eye; give the place that the scan was taken from")
-    return View(eye, right, np.cross(right, forward), forward, None if eye_mm is None else float(np.median(depth)))
+    return View(eye, right, -down, forward, None if eye_mm is None else float(np.median(depth)))
 
 
 def _used(points: FloatArray, faces: IntArray) -> BoolArray:

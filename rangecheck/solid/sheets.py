@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rangecheck import rigid
 from rangecheck.arrays import FloatArray, IntArray, float32_spacing_mm
 from rangecheck.kernels import kernel
 from rangecheck.solid.containment import shell_depths, shell_volumes_mm3
@@ -98,9 +99,7 @@ def _pairs_at(surface: Surface, table: topo.EdgeTable, edge: int) -> list[tuple[
     low, high = table.ends[edge]
     origin, axis = surface.vertices[low], surface.vertices[high] - surface.vertices[low]
     axis = axis / np.linalg.norm(axis)
-    u = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    u /= np.linalg.norm(u)
-    v = np.cross(axis, u)
+    u, v = rigid.across(axis)
     far = surface.vertices[surface.faces[halves // 3, (halves % 3 + 2) % 3]] - origin
     angle = np.arctan2(far @ v, far @ u)
     along = surface.faces[halves // 3, halves % 3] == low

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from rangecheck import rigid
 from rangecheck.arrays import BoolArray, FloatArray, IntArray, require
 from rangecheck.errors import SurfaceError
 from rangecheck.kernels import in_chunks, kernel
@@ -24,9 +25,8 @@ def frame_of(up: npt.ArrayLike) -> FloatArray:
     if not np.linalg.norm(z) > 0:
         raise SurfaceError("up has length 0; an orientation needs a direction")
     z = z / np.linalg.norm(z)
-    x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z])
+    x, y = rigid.across(z)
+    return np.stack([-x, -y, z])
 
 
 def section_areas_mm2(surface: Surface, heights_mm: FloatArray, up: npt.ArrayLike = (0.0, 1.0, 0.0)) -> FloatArray:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rangecheck.arrays import FloatArray, IntArray
-from rangecheck.kernels import inline_kernel, stage_kernel
+from rangecheck.kernels import inline_kernel
 from rangecheck.raycast import EmbreeCaster
 from rangecheck.scene import Scene
 
@@ -57,15 +57,6 @@ def sources_of(scene: Scene, caster: EmbreeCaster, channels: int) -> SourceArray
 @inline_kernel
 def dot(ax, ay, az, bx, by, bz):
     return ax * bx + ay * by + az * bz
-
-
-@stage_kernel
-def frame_around(z0, z1, z2):
-    """Two unit vectors that make a right-handed frame with the unit vector z (Duff et al. 2017)."""
-    sign = 1.0 if z2 >= 0.0 else -1.0
-    a = -1.0 / (sign + z2)
-    b = z0 * z1 * a
-    return 1.0 + sign * z0 * z0 * a, sign * b, -sign * z0, b, sign + z1 * z1 * a, -z1
 
 
 @inline_kernel

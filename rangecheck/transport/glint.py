@@ -15,8 +15,9 @@ import math
 
 import numpy as np
 
+from rangecheck.basis import frame_around
 from rangecheck.kernels import stage_kernel
-from rangecheck.transport.geometry import frame_around, place_hit
+from rangecheck.transport.geometry import place_hit
 from rangecheck.transport.reflection import spike_of
 from rangecheck.transport.scatter import mirror_ray
 

@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
+from rangecheck.basis import frame_around
 from rangecheck.kernels import inline_kernel, stage_kernel
 from rangecheck.scene.surroundings import add_surroundings
 from rangecheck.transport.chance import DIFFUSE_WAY, key_of, point, stream_of, turned
-from rangecheck.transport.geometry import frame_around
 from rangecheck.transport.irradiance_nodes import nodes_around
 from rangecheck.transport.queues import CAMERA
 

@@ -10,10 +10,10 @@ import math
 
 import numpy as np
 
+from rangecheck.basis import frame_around
 from rangecheck.kernels import inline_kernel, pasted_kernel, stage_kernel
 from rangecheck.scene.sources import form_factor
 from rangecheck.transport.chance import SHADOW, fill_disc, fill_points, key_of, point
-from rangecheck.transport.geometry import frame_around
 from rangecheck.transport.queues import DIFFUSE
 from rangecheck.transport.reflection import diffuse_of, lobe_of
 

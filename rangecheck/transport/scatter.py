@@ -11,9 +11,9 @@ import math
 
 import numpy as np
 
+from rangecheck.basis import frame_around
 from rangecheck.kernels import pasted_kernel, stage_kernel
 from rangecheck.transport.chance import BRANCH, CHOICE, DIFFUSE_WAY, key_of, point, turned
-from rangecheck.transport.geometry import frame_around
 from rangecheck.transport.queues import CAMERA, DIFFUSE, LOBE, SPIKE
 from rangecheck.transport.reflection import diffuse_of, draw_lobe, lobe_guess, lobe_of, spike_of
 

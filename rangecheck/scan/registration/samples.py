@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rangecheck.arrays import BoolArray, FloatArray, unit_vectors
+from rangecheck.basis import frame_around
 from rangecheck.errors import CameraError, ScanError
 from rangecheck.kernels import in_chunks, kernel
 from rangecheck.optics import Camera
@@ -192,12 +193,7 @@ def _fit_quadrics(
             if not np.isfinite(points[i, j, 0]):
                 continue
             dx, dy, dz = rays[i, j, 0], rays[i, j, 1], rays[i, j, 2]
-            # two directions across the ray (Duff et al., Building an orthonormal basis, revisited, 2017)
-            sign = 1.0 if dz >= 0 else -1.0
-            a = -1.0 / (sign + dz)
-            b = dx * dy * a
-            e1x, e1y, e1z = 1.0 + sign * dx * dx * a, sign * b, -sign * dx
-            e2x, e2y, e2z = b, sign + dy * dy * a, -dy
+            e1x, e1y, e1z, e2x, e2y, e2z = frame_around(dx, dy, dz)
             n = 0
             total = 0.0
             edge = False
