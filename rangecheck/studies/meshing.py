@@ -14,64 +14,21 @@ from functools import partial
 import numpy as np
 
 from rangecheck.analytic.bust import bust_distance_mm
-from rangecheck.arrays import FloatArray, IntArray
 from rangecheck.errors import InputError
 from rangecheck.scan import RangeScan
 from rangecheck.studies.bust_scans import bust_ring, near_samples, real_data, sample_scans
 from rangecheck.studies.meshing_busts import busts
 from rangecheck.studies.meshing_edges import KNOBS, knob_part
 from rangecheck.studies.meshing_growth import growth, memory
+from rangecheck.studies.meshing_methods import Method, methods
 from rangecheck.study import Candidate, Measurement, Part, SpeedChart, measure, study_of_parts
-from rangecheck.surface.meshing import fuse, grid_mesh, pivot
-from rangecheck.surface.meshing.oriented import open3d, oriented_points, spacing_of
-from rangecheck.surface.meshing.poisson import BOX_SCALE
+from rangecheck.surface.meshing import grid_mesh
+from rangecheck.surface.meshing.oriented import spacing_of
 from rangecheck.surface.surface import Surface
 from rangecheck.surface.topology import boundary_edges
 
 #: vertices whose distance from the truth is measured: an RMS over as many is known to 0.3 %
 MOST_JUDGED = 60_000
-
-
-def open3d_poisson(scans: Sequence[RangeScan], depth: int) -> Surface:
-    """open3d's screened Poisson on all threads, its normals included."""
-    engine = open3d()
-    points, normals = oriented_points(scans)
-    cloud = engine.geometry.PointCloud(engine.utility.Vector3dVector(points))
-    cloud.normals = engine.utility.Vector3dVector(normals)
-    with engine.utility.VerbosityContextManager(engine.utility.VerbosityLevel.Error):
-        mesh, _ = engine.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, scale=BOX_SCALE, n_threads=-1)
-    return _surface(np.asarray(mesh.vertices), np.asarray(mesh.triangles))
-
-
-def meshlab_poisson(scans: Sequence[RangeScan], depth: int) -> Surface:
-    """MeshLab's screened Poisson on all threads, the normals included."""
-    import os
-
-    import pymeshlab
-
-    points, normals = oriented_points(scans)
-    meshes = pymeshlab.MeshSet(verbose=False)
-    meshes.add_mesh(pymeshlab.Mesh(vertex_matrix=points, v_normals_matrix=normals))
-    meshes.generate_surface_reconstruction_screened_poisson(depth=depth, scale=BOX_SCALE, threads=os.cpu_count() or 1)
-    made = meshes.current_mesh()
-    return _surface(made.vertex_matrix(), made.face_matrix())
-
-
-def _surface(vertices: FloatArray, faces: IntArray) -> Surface:
-    surface = Surface(np.array(vertices, float), np.asarray(faces).astype(np.int32))
-    return surface.with_faces(np.arange(len(surface.faces)))
-
-
-Method = Callable[[Sequence[RangeScan]], Surface]
-
-
-def methods(depths: Sequence[int]) -> dict[tuple[str, str], Method]:
-    """Every method that takes several scans, by name and setting."""
-    found: dict[tuple[str, str], Method] = {("fuse", ""): fuse}
-    for depth in depths:
-        found["Poisson, open3d", f"depth {depth}"] = partial(open3d_poisson, depth=depth)
-        found["Poisson, MeshLab", f"depth {depth}"] = partial(meshlab_poisson, depth=depth)
-    return found | {("pivot", ""): pivot}
 
 
 def _compared(

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from rangecheck.studies.bust_scans import bust_ring, sample_scans
+from rangecheck.studies.meshing_methods import methods
 from rangecheck.study import Line, LineChart, Part, peak_memory_mb
 
 #: share of the cells of a view of the bust that hold a distance
@@ -75,9 +76,7 @@ def growth(quick: bool) -> Part:
 
 
 def meshed_alone(name: str, setting: str, quick: bool) -> dict[str, Any]:
-    """Mesh the sample bust by one method of `studies.meshing`; the memory that this took, beyond the scans and the packages."""
-    from rangecheck.studies.meshing import methods
-
+    """Mesh the sample bust by one method; the memory that this took, beyond the scans and the packages."""
     scans = bust_ring(width=96) if quick else list(sample_scans())
     make = methods((6,) if quick else (8, 9))[name, setting]
     make(bust_ring(3, width=64))
@@ -88,8 +87,6 @@ def meshed_alone(name: str, setting: str, quick: bool) -> dict[str, Any]:
 
 def memory(quick: bool) -> Part:
     """Peak memory of every method on the sample bust."""
-    from rangecheck.studies.meshing import methods
-
     wanted = [("fuse", "")] if quick else list(methods((8, 9)))
     rows = [alone(meshed_alone, name, setting, quick) for name, setting in wanted]
     findings = [

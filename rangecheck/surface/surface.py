@@ -158,9 +158,9 @@ class Surface:
 
     def _repr_png_(self) -> bytes:
         """A notebook's look at the surface from the front (+z), a little from above and from its left."""
-        from rangecheck.surface.look import look_at_surface
+        from rangecheck.surface.look import look_at_faces
 
-        return look_at_surface(self)
+        return look_at_faces(self.vertices, self.faces, self.face_normals, self.vertex_normals)
 
     def moved(self, motion: FloatArray) -> Surface:
         """The same surface after a rigid motion (4, 4)."""
