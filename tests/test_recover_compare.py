@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from rangecheck_cli.main import exit_status
 
+from rangecheck.analytic.shapes import Sphere
 from rangecheck.errors import ScanError
 from rangecheck.optics import PinholeCamera
 from rangecheck.recover.compare import compare
 from rangecheck.recover.grid import normals_at, scan_grid
 from rangecheck.recover.lights import Light
 from rangecheck.scan import RangeScan
+from rangecheck.studies.fit_alexander import dented
 
 SIZE, RADIUS_MM, AWAY_MM = 200, 80.0, 600.0
 LAMP = np.array([0.5, -0.4, -0.77]) / np.linalg.norm([0.5, -0.4, -0.77])
@@ -23,12 +25,11 @@ def ball_scan(range_noise_mm=0.02, picture_noise=0.01, paint=0.0, seed=0):
     camera = PinholeCamera.from_field_of_view(SIZE, SIZE, 16.0)
     _, rays = camera.pixel_rays()
     centre = np.array([0.0, 0.0, AWAY_MM])
-    b = rays @ centre
-    inside = b * b - (AWAY_MM**2 - RADIUS_MM**2)
-    distance = b - np.sqrt(np.where(inside > 0, inside, np.nan))
-    points = distance[..., None] * rays
-    normals = (points - centre) / RADIUS_MM
-    seen = -(normals * rays).sum(-1) > 0.25
+    sphere = Sphere(RADIUS_MM)
+    distance = sphere.first_hit(-centre, rays)
+    points = np.where(np.isfinite(distance), distance, AWAY_MM)[..., None] * rays
+    normals = sphere.normal(points - centre)
+    seen = np.isfinite(distance) & (-(normals * rays).sum(-1) > 0.25)
     albedo = 0.7 * (1.0 + paint * (np.sin(points[..., 0] / 3.0) * np.sin(points[..., 1] / 4.0) > 0.3))
     bright = albedo * np.maximum((normals * LAMP).sum(-1), 0.0) + rng.normal(0, picture_noise, (SIZE, SIZE))
     ranges = np.where(seen, distance + rng.normal(0, range_noise_mm, (SIZE, SIZE)), np.nan)
@@ -41,13 +42,6 @@ def ball_scan(range_noise_mm=0.02, picture_noise=0.01, paint=0.0, seed=0):
 def clean():
     scan = ball_scan()
     return scan, compare(scan, scale_mm=2.5)
-
-
-def dented(scan, row, column, depth_mm=1.0, radius_mm=10.0):
-    points = scan.grid_points_mm
-    apart = np.linalg.norm(points - points[row, column], axis=-1)
-    deeper = np.where(apart < radius_mm, 0.5 * depth_mm * (1 + np.cos(np.pi * np.minimum(apart / radius_mm, 1))), 0.0)
-    return replace(scan, range_mm=(scan.range_mm + deeper).astype(np.float32))
 
 
 def test_normals_of_a_scanned_ball_are_those_of_the_ball():
@@ -73,7 +67,7 @@ def test_nothing_is_named_where_scan_and_picture_are_of_the_same_thing(clean):
 
 def test_a_dent_that_the_picture_does_not_show_is_named_at_its_place_with_its_depth(clean):
     scan, found = clean
-    dent = compare(dented(scan, 110, 90), scale_mm=2.5, fitted=found.fitted)
+    dent = compare(dented(scan, scan.grid_points_mm[110, 90], depth_mm=1.0, radius_mm=10.0), scale_mm=2.5, fitted=found.fitted)
     assert len(dent.regions) >= 1
     assert all(np.linalg.norm(np.subtract(r.middle_mm, scan.grid_points_mm[110, 90])) < 12.0 for r in dent.regions)
     worst = dent.regions[0]
@@ -117,7 +111,7 @@ def test_check_names_the_place_in_mm_and_explains_it(tmp_path, clean, capsys):
     from rangecheck.scan.readers import write_scans
 
     scan = clean[0]
-    for name, made in (("clean", scan), ("dented", dented(scan, 110, 90))):
+    for name, made in (("clean", scan), ("dented", dented(scan, scan.grid_points_mm[110, 90], depth_mm=1.0, radius_mm=10.0))):
         write_scans(tmp_path / name, [replace(made, name=name, brightness=np.nan_to_num(made.brightness))], step_mm=0.01)
         capsys.readouterr()
         exit_status(["check", str(tmp_path / name), "--json"])

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from rangecheck.analytic.shapes import Sphere
 from rangecheck.arrays import FloatArray
 from rangecheck.optics import PinholeCamera
 from rangecheck.recover.compare import compare
@@ -43,11 +44,11 @@ def ball(seed: int, guess: Guess = _BALL) -> tuple[RangeScan, FloatArray]:
     camera = PinholeCamera.from_field_of_view(SIZE, SIZE, 16.0)
     _, rays = camera.pixel_rays()
     centre = np.array([0.0, 0.0, AWAY_MM])
-    b = rays @ centre
-    inside = b * b - (AWAY_MM**2 - RADIUS_MM**2)
-    distance = b - np.sqrt(np.where(inside > 0, inside, np.nan))
-    normals = (distance[..., None] * rays - centre) / RADIUS_MM
-    seen = -(normals * rays).sum(-1) > 0.25
+    sphere = Sphere(RADIUS_MM)
+    distance = sphere.first_hit(-centre, rays)
+    met = np.isfinite(distance)
+    normals = sphere.normal(np.where(met, distance, AWAY_MM)[..., None] * rays - centre)
+    seen = met & (-(normals * rays).sum(-1) > 0.25)
     exact = RangeScan(np.where(seen, distance, np.nan).astype(np.float32), camera, brightness=np.zeros((SIZE, SIZE), np.float32))
     cell = np.flatnonzero(seen)
     n = len(cell)
