@@ -15,6 +15,7 @@ import math
 import numpy as np
 
 from rangecheck.basis import frame_around
+from rangecheck.equations import cholesky
 from rangecheck.kernels import inline_kernel, kernel
 
 #: of the polynomial that holds the smooth form
@@ -29,23 +30,6 @@ SECTORS, FILLED, NORMALS = 8, 0.25, 2.0
 QUIET = 3.0
 #: polynomial terms, and the hollow
 _TERMS = DEGREE * (DEGREE + 3) // 2 + 1
-
-
-@kernel
-def _factored(gram, count):
-    """Cholesky factor of the symmetric gram[:count, :count], in its lower half; False where it is singular."""
-    for i in range(count):
-        for j in range(i + 1):
-            value = gram[i, j]
-            for k in range(j):
-                value -= gram[i, k] * gram[j, k]
-            if i > j:
-                gram[i, j] = value / gram[j, j]
-            elif value <= 1e-13 * gram[0, 0]:
-                return False
-            else:
-                gram[i, i] = math.sqrt(value)
-    return True
 
 
 @kernel
@@ -168,7 +152,7 @@ def matched(points, normals, noise, weight, first, begins, who, reach, half_widt
                 right[i] = wuu * products[i, 0] + wuv * (products[i, 1] + products[i, 2]) + wvv * products[i, 3]
                 for j in range(i + 1):
                     gram[i, j] = wuu * gram_uu[i, j] + wuv * gram_uv[i, j] + wvv * gram_vv[i, j]
-            if not _factored(gram, _TERMS):
+            if not cholesky(gram, _TERMS, 0.0, 1e-13 * gram[0, 0]):
                 ratios[s] = np.nan
                 break
             total = wuu * ends[7] + 2.0 * wuv * ends[8] + wvv * ends[9]

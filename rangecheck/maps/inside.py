@@ -1,21 +1,19 @@
 """Is a focal point inside the matter? Generalised winding number of triangles about a point.
 
-Each triangle contributes its signed solid angle (Van Oosterom & Strackee, *The solid angle of a plane triangle*, 1983); the sum
-over 4 pi is 1 inside a closed surface with outward faces, 0 outside it and in its cavities, and a fraction where the surface is
-open (Jacobson, Kavan, Sorkine-Hornung, *Robust inside-outside segmentation using generalized winding numbers*, 2013).
+The sum of the triangles' signed solid angles over 4 pi is 1 inside a closed surface with outward faces, 0 outside it and in its
+cavities, and a fraction where the surface is open (Jacobson, Kavan, Sorkine-Hornung, *Robust inside-outside segmentation using
+generalized winding numbers*, 2013).
 """
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 
 from rangecheck.arrays import FloatArray, require
 from rangecheck.errors import SceneError
-from rangecheck.kernels import in_chunks, kernel
 from rangecheck.optics import Camera
 from rangecheck.rigid import move_points
+from rangecheck.solid.containment import winding_numbers
 from rangecheck.surface import Surface
 
 #: a point that sees the back of the surface over more than half of all directions is inside it
@@ -24,39 +22,9 @@ INSIDE = 0.5
 PIXELS_PER_SIDE = 5
 
 
-@kernel
-def _solid_angles(points_mm, vertices_mm, faces, start, stop, total):
-    for i in range(points_mm.shape[0]):
-        angle = 0.0
-        for f in range(start, stop):
-            ax = vertices_mm[faces[f, 0], 0] - points_mm[i, 0]
-            ay = vertices_mm[faces[f, 0], 1] - points_mm[i, 1]
-            az = vertices_mm[faces[f, 0], 2] - points_mm[i, 2]
-            bx = vertices_mm[faces[f, 1], 0] - points_mm[i, 0]
-            by = vertices_mm[faces[f, 1], 1] - points_mm[i, 1]
-            bz = vertices_mm[faces[f, 1], 2] - points_mm[i, 2]
-            cx = vertices_mm[faces[f, 2], 0] - points_mm[i, 0]
-            cy = vertices_mm[faces[f, 2], 1] - points_mm[i, 1]
-            cz = vertices_mm[faces[f, 2], 2] - points_mm[i, 2]
-            a = math.sqrt(ax * ax + ay * ay + az * az)
-            b = math.sqrt(bx * bx + by * by + bz * bz)
-            c = math.sqrt(cx * cx + cy * cy + cz * cz)
-            triple = ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
-            ab, bc, ca = ax * bx + ay * by + az * bz, bx * cx + by * cy + bz * cz, cx * ax + cy * ay + cz * az
-            angle += 2.0 * math.atan2(triple, a * b * c + ab * c + bc * a + ca * b)
-        total[i] = angle
-
-
 def winding_number(surface: Surface, points_mm: FloatArray) -> FloatArray:
     """Winding number (n,) of the surface about points (n, 3) in the world frame: 1 inside a solid, 0 outside."""
-    points = require("points_mm", points_mm, (None, 3), finite=True)
-
-    def part(start: int, stop: int) -> FloatArray:
-        total = np.empty(len(points))
-        _solid_angles(points, surface.vertices, surface.faces, start, stop, total)
-        return total
-
-    return sum(in_chunks(part, len(surface.faces), 65536), np.zeros(len(points))) / (4 * math.pi)
+    return winding_numbers(surface, require("points_mm", points_mm, (None, 3), finite=True))
 
 
 def ray_origins_mm(camera: Camera) -> FloatArray:

@@ -258,6 +258,17 @@ def _finite_ray(origins, directions, i):
     return total - total == 0.0
 
 
+@inline_kernel
+def _fill_ray(ray, words, origins, directions, far, i):
+    for axis in range(3):
+        ray[_ORIGIN + axis] = origins[i, axis]
+        ray[_DIRECTION + axis] = directions[i, axis]
+    ray[_NEAR] = ray[_TIME] = 0.0
+    ray[_FAR] = far[i]
+    words[_MASK] = -1
+    words[_ID] = words[_FLAGS] = 0
+
+
 @kernel
 def _closest_single(function, scene, origins, directions, far, face, u, v):
     """One ray per call: best where neighbouring rays have little in common."""
@@ -265,13 +276,7 @@ def _closest_single(function, scene, origins, directions, far, face, u, v):
     words = ray.view(np.int32)
     place = ray.ctypes.data
     for i in range(len(origins)):
-        for axis in range(3):
-            ray[_ORIGIN + axis] = origins[i, axis]
-            ray[_DIRECTION + axis] = directions[i, axis]
-        ray[_NEAR] = ray[_TIME] = 0.0
-        ray[_FAR] = far[i]
-        words[_MASK] = -1
-        words[_ID] = words[_FLAGS] = 0
+        _fill_ray(ray, words, origins, directions, far, i)
         words[_PRIMITIVE] = words[_GEOMETRY] = words[_INSTANCE] = -1
         if _finite_ray(origins, directions, i):
             _call3(function, scene, place, 0)
@@ -288,13 +293,7 @@ def _occluded_single(function, scene, origins, directions, far, blocked):
     words = ray.view(np.int32)
     place = ray.ctypes.data
     for i in range(len(origins)):
-        for axis in range(3):
-            ray[_ORIGIN + axis] = origins[i, axis]
-            ray[_DIRECTION + axis] = directions[i, axis]
-        ray[_NEAR] = ray[_TIME] = 0.0
-        ray[_FAR] = far[i]
-        words[_MASK] = -1
-        words[_ID] = words[_FLAGS] = 0
+        _fill_ray(ray, words, origins, directions, far, i)
         if _finite_ray(origins, directions, i):
             _call3(function, scene, place, 0)
         blocked[i] = ray[_FAR] < 0.0

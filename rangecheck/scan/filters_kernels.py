@@ -12,6 +12,7 @@ import math
 import numpy as np
 
 from rangecheck.arrays import FloatArray, IntArray
+from rangecheck.equations import cholesky, substituted
 from rangecheck.kernels import inline_kernel, kernel
 
 
@@ -250,32 +251,13 @@ def fit6(basis, weights, values, member, matrix, right, solution):
                 right[a] += weighted * values[k]
                 for b in range(a + 1):
                     matrix[a, b] += weighted * basis[k, b]
-    return solve6(matrix, right, solution)
+    return solved6(matrix, right, solution)
 
 
 @kernel
-def solve6(matrix, right, solution):
-    """Cholesky's solution of six positive definite equations; False where they are not."""
-    n = 6
-    for a in range(n):
-        for b in range(a + 1):
-            total = matrix[a, b]
-            for k in range(b):
-                total -= matrix[a, k] * matrix[b, k]
-            if a == b:
-                if total <= 1e-12:
-                    return False
-                matrix[a, a] = math.sqrt(total)
-            else:
-                matrix[a, b] = total / matrix[b, b]
-    for a in range(n):
-        total = right[a]
-        for k in range(a):
-            total -= matrix[a, k] * solution[k]
-        solution[a] = total / matrix[a, a]
-    for a in range(n - 1, -1, -1):
-        total = solution[a]
-        for k in range(a + 1, n):
-            total -= matrix[k, a] * solution[k]
-        solution[a] = total / matrix[a, a]
+def solved6(matrix, right, solution):
+    """Solves six positive definite equations; False where they are not."""
+    if not cholesky(matrix, 6, 0.0, 1e-12):
+        return False
+    substituted(matrix, 6, right, solution)
     return True

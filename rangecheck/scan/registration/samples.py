@@ -15,6 +15,7 @@ import numpy as np
 
 from rangecheck.arrays import BoolArray, FloatArray, unit_vectors
 from rangecheck.basis import frame_around
+from rangecheck.equations import cholesky, substituted
 from rangecheck.errors import CameraError, ScanError
 from rangecheck.kernels import in_chunks, kernel
 from rangecheck.optics import Camera
@@ -225,9 +226,9 @@ def _fit_quadrics(
                             system[k, m] += f[k] * f[m]
             border[row, column] = edge
             # six numbers from at least nine readings
-            if n < 9 or not _factored(system):
+            if n < 9 or not cholesky(system, 6, 1e-4, 0.0):
                 continue
-            _solved(system, right, answer)
+            substituted(system, 6, right, answer)
             residual = total
             for k in range(6):
                 residual -= answer[k] * right[k]
@@ -241,46 +242,12 @@ def _fit_quadrics(
             for k in range(3):
                 f[:] = 0.0
                 f[k] = 1.0
-                _solved(system, f, answer)
+                substituted(system, 6, f, answer)
                 if k == 0:
                     spread[row, column] = answer[0]
                     tilt[row, column] = 0.0
                 else:
                     tilt[row, column] += 0.5 * answer[k] / (unit * unit)
-
-
-@kernel
-def _factored(system):
-    """Cholesky's factor in the lower triangle, in place; False where the readings do not determine six numbers."""
-    for k in range(6):
-        pivot = system[k, k]
-        least = 1e-4 * pivot
-        for m in range(k):
-            pivot -= system[k, m] * system[k, m]
-        if not pivot > least:
-            return False
-        system[k, k] = math.sqrt(pivot)
-        for r in range(k + 1, 6):
-            value = system[r, k]
-            for m in range(k):
-                value -= system[r, m] * system[k, m]
-            system[r, k] = value / system[k, k]
-    return True
-
-
-@kernel
-def _solved(factor, right, answer):
-    """The solution for a right-hand side, by forward and back substitution."""
-    for k in range(6):
-        value = right[k]
-        for m in range(k):
-            value -= factor[k, m] * answer[m]
-        answer[k] = value / factor[k, k]
-    for k in range(5, -1, -1):
-        value = answer[k]
-        for m in range(k + 1, 6):
-            value -= factor[m, k] * answer[m]
-        answer[k] = value / factor[k, k]
 
 
 def facing(samples: Samples) -> FloatArray:

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from rangecheck.equations import cholesky, substituted
 from rangecheck.kernels import inline_kernel, kernel
 
 #: how far, in tangent of slope, the surface may bend within a window before a neighbour is taken for another surface
@@ -20,36 +21,6 @@ RIDGE = 2.0
 def allowed_step(distance_px, pitch_mm, sigma_mm):
     """Largest departure from the local plane, at `distance_px`, of a sample of the same surface."""
     return 5.0 * sigma_mm + BEND_TAN * pitch_mm * distance_px
-
-
-@kernel
-def _cholesky(a):
-    """Lower factor of the symmetric 6 x 6 matrix whose lower half is in `a`, in place; False when it is not positive definite."""
-    for i in range(6):
-        for j in range(i + 1):
-            s = a[i, j]
-            for k in range(j):
-                s -= a[i, k] * a[j, k]
-            if i == j:
-                if s <= 1e-12:
-                    return False
-                a[i, i] = math.sqrt(s)
-            else:
-                a[i, j] = s / a[j, j]
-    return True
-
-
-@kernel
-def _solve(a, b):
-    """b becomes the solution of (a a^T) x = b for a lower factor a."""
-    for i in range(6):
-        for k in range(i):
-            b[i] -= a[i, k] * b[k]
-        b[i] /= a[i, i]
-    for i in range(5, -1, -1):
-        for k in range(i + 1, 6):
-            b[i] -= a[k, i] * b[k]
-        b[i] /= a[i, i]
 
 
 @kernel
@@ -93,10 +64,10 @@ def edge_fit(ranges, row, col, plane_u, plane_v, pitch_mm, sigma, widths, confid
             a[i, i] += ridge
         unit[:] = 0.0
         unit[0] = 1.0
-        if not _cholesky(a):
+        if not cholesky(a, 6, 0.0, 1e-12):
             continue
-        _solve(a, b)
-        _solve(a, unit)
+        substituted(a, 6, b, b)
+        substituted(a, 6, unit, unit)
         variance = 0.0
         for dv in range(max(-reach, -row), min(reach, height - 1 - row) + 1):
             for du in range(max(-reach, -col), min(reach, width - 1 - col) + 1):
