@@ -16,6 +16,7 @@ import functools
 import hashlib
 import os
 import re
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -28,7 +29,14 @@ from numba.core import caching, config, event
 
 from rangecheck import progress
 
+try:
+    import fcntl
+except ImportError:  # Windows: two processes may compile the same kernel
+    fcntl = None  # type: ignore[assignment]
+
 T = TypeVar("T")
+#: after that long another process that still compiles a kernel is no longer waited for
+_LONGEST_COMPILE_S = 120.0
 _PACKAGE = Path(__file__).resolve().parent
 _IMPORT = re.compile(r"^(?:from (\.*)([\w.]*) import ([^#\n(]+|\([^)]*\))|import (rangecheck[\w.]*))", re.MULTILINE)
 
@@ -99,6 +107,61 @@ class UserCache(_ByAllSources, caching.UserWideCacheLocator):
     """In the user's cache folder."""
 
 
+class _CompiledOnce(caching.FunctionCache):
+    """Numba's cache of one kernel, which one process at a time fills: others that need the same wait for it and load what it saved.
+
+    A kernel waits only for kernels that it calls, so no two processes wait for each other."""
+
+    _lock: int | None = None
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        found = super().load_overload(sig, target_context)
+        if found is None and self._lock is None:
+            self._lock = self._locked()
+            found = None if self._lock is None else super().load_overload(sig, target_context)
+            if found is not None:
+                self.release()
+        return found
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        try:
+            super().save_overload(sig, data)
+        finally:
+            self.release()
+
+    def release(self) -> None:
+        """Let others go on: the kernel is saved, or could not be compiled."""
+        if self._lock is not None:
+            self._lock_path.unlink(missing_ok=True)
+            os.close(self._lock)
+            self._lock = None
+
+    @property
+    def _lock_path(self) -> Path:
+        return Path(self.cache_path, f"{self._impl.filename_base}.lock")
+
+    def _locked(self) -> int | None:
+        """The lock, or None where the file system has none or another process keeps it for longer than a kernel takes."""
+        if fcntl is None:
+            return None
+        try:
+            Path(self.cache_path).mkdir(parents=True, exist_ok=True)
+            handle = os.open(self._lock_path, os.O_CREAT | os.O_RDWR)
+        except OSError:
+            return None
+        end = time.monotonic() + _LONGEST_COMPILE_S
+        while time.monotonic() < end:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return handle
+            except BlockingIOError:
+                time.sleep(0.02)
+            except OSError:
+                break
+        os.close(handle)
+        return None
+
+
 _LOCATORS = ",".join(f"{__name__}.{locator.__name__}" for locator in (GivenFolder, BesideSource, UserCache))
 
 
@@ -107,7 +170,10 @@ def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         before = config.CACHE_LOCATOR_CLASSES
         config.CACHE_LOCATOR_CLASSES = _LOCATORS
         try:
-            return numba.njit(cache=True, error_model="numpy", nogil=True, **options)(function)
+            made = numba.njit(error_model="numpy", nogil=True, **options)(function)
+            if not config.DISABLE_JIT:  # as cache=True would
+                made._cache = _CompiledOnce(function)
+            return made
         except RuntimeError:  # no folder for compiled kernels can be written: every start compiles anew
             return numba.njit(error_model="numpy", nogil=True, **options)(function)
         finally:
@@ -129,8 +195,8 @@ _threads = 0
 _here = local()
 
 
-class _FirstCompile(event.Listener):
-    """Tells that kernels are being compiled, which takes long and happens once on a machine."""
+class _Compiling(event.Listener):
+    """Tells that kernels are being compiled, which takes long and happens once on a machine; unlocks what could not be."""
 
     def on_start(self, event: event.Event) -> None:
         tell, progress.on_first_compile = progress.on_first_compile, None
@@ -138,10 +204,13 @@ class _FirstCompile(event.Listener):
             tell()
 
     def on_end(self, event: event.Event) -> None:
-        pass
+        made = event.data["dispatcher"]
+        # numba's `is_failed` says the opposite
+        if tuple(event.data["args"]) not in made.overloads and isinstance(made._cache, _CompiledOnce):
+            made._cache.release()
 
 
-event.register("numba:compile", _FirstCompile())
+event.register("numba:compile", _Compiling())
 
 
 def thread_count() -> int:

@@ -1,17 +1,23 @@
 """Errors keep what they measured; arrays are refused by name; rigid motions undo themselves; files are whole or absent."""
 
+import fcntl
 import json
 import math
+import os
+import subprocess
+import sys
+import time
 import tomllib
 from pathlib import Path
 from types import SimpleNamespace
 
+import numba
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rangecheck import arrays, errors, files, kernels, progress, rigid
+from rangecheck import arrays, equations, errors, files, kernels, progress, rigid
 from rangecheck.basis import frame_around
 from rangecheck.config import load_settings
 
@@ -146,6 +152,41 @@ def test_a_changed_source_changes_the_key_of_kernels_that_import_it(tmp_path, mo
     kernels.sources_of.cache_clear()
 
 
+def test_a_kernel_that_another_process_compiles_is_waited_for_and_loaded(tmp_path):
+    (tmp_path / "alike.py").write_text("from rangecheck.kernels import kernel\n\n\n@kernel\ndef twice(x):\n    return 2 * x\n")
+    ask = "import alike; print('ready', flush=True); print(alike.twice(21)); print(sum(alike.twice.stats.cache_misses.values()))"
+    told = {"cwd": tmp_path, "env": os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kept"), "PYTHONPATH": str(tmp_path)}}
+    assert subprocess.run([sys.executable, "-c", ask], **told, capture_output=True, text=True).stdout.split() == [
+        "ready",
+        "42",
+        "1",
+    ]
+    saved = {path: path.read_bytes() for path in (tmp_path / "kept").rglob("*.nb?")}
+    assert len(saved) == 2 and not list((tmp_path / "kept").rglob("*.lock"))
+    for path in saved:
+        path.unlink()
+    # this process stands for one that is compiling
+    index = next(path for path in saved if path.suffix == ".nbi")
+    lock = index.with_suffix(".lock")
+    with lock.open("w") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        with subprocess.Popen([sys.executable, "-c", ask], **told, stdout=subprocess.PIPE, text=True) as waiting:
+            assert waiting.stdout.readline() == "ready\n"
+            time.sleep(1.0)
+            assert waiting.poll() is None
+            for path, content in saved.items():
+                path.write_bytes(content)
+            fcntl.flock(held, fcntl.LOCK_UN)
+            assert waiting.communicate(timeout=60)[0].split() == ["42", "0"]
+
+
+def test_a_kernel_that_cannot_be_compiled_keeps_nobody_waiting():
+    made = kernels.kernel(lambda x: x.nothing)
+    with pytest.raises(numba.TypingError):
+        made(3)
+    assert made._cache._lock is None and not made._cache._lock_path.exists()
+
+
 def test_where_no_cache_can_be_written_kernels_compile_all_the_same(monkeypatch):
     for locator in (kernels.GivenFolder, kernels.BesideSource, kernels.UserCache):
         monkeypatch.setattr(locator, "from_function", classmethod(lambda cls, function, file: None))
@@ -183,3 +224,19 @@ def test_two_directions_across_a_third_make_a_right_handed_frame_with_it(frames)
     assert (
         np.abs(np.einsum("kni,lni->kln", np.stack([u, v, z]), np.stack([u, v, z])) - np.eye(3)[..., None]).max() < some_roundings
     )
+
+
+def test_a_factored_system_gives_back_its_solution_and_a_singular_one_is_told():
+    rng = np.random.default_rng(5)
+    rows = rng.normal(size=(9, 6))
+    system, answer = rows.T @ rows, rng.normal(size=6)
+    factor, found = np.tril(system), system @ answer
+    assert equations.cholesky(factor, 6, 1e-4, 0.0)
+    equations.substituted(factor, 6, found, found)
+    assert np.abs(found - answer).max() < 16 * np.linalg.cond(system) * np.finfo(float).eps
+    rows[:, 5] = rows[:, 4]
+    assert not equations.cholesky(rows.T @ rows, 6, 1e-4, 0.0)
+    # of the first five, which are sound, the factor is numpy's
+    sound = rows.T @ rows
+    assert equations.cholesky(sound, 5, 1e-4, 0.0)
+    np.testing.assert_allclose(np.tril(sound[:5, :5]), np.linalg.cholesky((rows.T @ rows)[:5, :5]), rtol=1e-12)
