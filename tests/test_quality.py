@@ -15,6 +15,7 @@ from rangecheck.scan import RangeScan
 from rangecheck.scan.quality import PROFILES, Profile, assess
 from rangecheck.scan.quality_space import Space as SeenSpace
 from rangecheck.scan.quality_space import directions, shell_of, views_from
+from rangecheck.scan.quality_sphere import counted, in_letters
 from rangecheck.scan.readers import read_scans
 from rangecheck.scan.simulate import RangeFinder, simulate_scan
 from rangecheck.surface import Surface
@@ -72,8 +73,14 @@ def test_half_a_ball_that_nobody_saw_is_seen_best_from_its_own_side():
     assert seen.mean() > 0.97
 
 
-def test_a_level_ring_misses_the_poles_and_the_next_view_is_one_of_them(views, poles):
-    quality = assess(views, cells=CELLS, elevation_deg=(-90, 90))
+@pytest.fixture(scope="module")
+def level(views):
+    """What the level ring is worth."""
+    return assess(views, cells=CELLS, elevation_deg=(-90, 90))
+
+
+def test_a_level_ring_misses_the_poles_and_the_next_view_is_one_of_them(level, views, poles):
+    quality = level
     assert 0.6 < quality.seen < 0.95
     assert {np.sign(round(g.centre_mm[1])) for g in quality.gaps[:2]} == {1, -1}
     assert quality.next_view is not None and abs(quality.next_view.elevation_deg) > 50
@@ -82,6 +89,26 @@ def test_a_level_ring_misses_the_poles_and_the_next_view_is_one_of_them(views, p
     assert both.seen > 0.97 > quality.seen
     assert both.coverage > 0.99 > quality.coverage
     assert not any(f.code == "scan-unseen" for f in both.findings)
+
+
+def test_the_drawing_of_a_level_ring_shows_its_scans_around_the_middle_and_the_next_view_where_none_has_a_sample(level):
+    meaning, *rows, axis = level.drawing
+    assert all(said in meaning for said in ("no scan", "so many scans", "where a scan was taken from", "the next view"))
+    sphere = [row[5:] for row in rows]
+    assert len(sphere) == 9 and {len(row) for row in sphere} == {36} and axis.split() == ["-180", "-90", "0", "+90", "+180"]
+    assert [row.count("o") for row in sphere] == [0, 0, 0, 0, 8, 0, 0, 0, 0]
+    # every direction of the middle is seen by more than one scan of eight, and most around the poles by none
+    assert set(sphere[4]) <= set("o23456")
+    assert all(row.count("·") > 18 for row in (sphere[0], sphere[8]))
+    assert sum(row.count("N") for row in sphere) == 1
+    at = next(k for k, row in enumerate(sphere) if "N" in row)
+    assert abs(90 - 20 * (at + 0.5) - level.next_view.elevation_deg) <= 10
+
+
+def test_the_drawing_has_the_front_in_the_middle_and_what_lies_towards_x_on_its_right():
+    counts = counted([np.array([[0.0, 0.0, 5.0]]), np.array([[5.0, 0.0, 0.0], [0.0, 0.0, 5.0]])], np.zeros(3), (9, 36))
+    middle = in_letters(counts, [], None)[4]
+    assert middle == "  +0 " + 18 * "·" + "2" + 8 * "·" + "1" + 8 * "·"
 
 
 def test_the_view_that_is_missing_is_the_one_proposed(views, poles):

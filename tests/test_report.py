@@ -11,13 +11,14 @@ from report_cases import job_of_a_vase, vase
 
 from rangecheck.optics import PinholeCamera
 from rangecheck.pipeline import likeness as likenesses
-from rangecheck.pipeline.likeness import coverage, lighter, likeness
+from rangecheck.pipeline.likeness import lighter, likeness
 from rangecheck.pipeline.page import page_of
 from rangecheck.report import Coverage, Figure, ReportContent, report_html
 from rangecheck.report.pack import octahedral, packed, packed_floats, unpacked
 from rangecheck.report.sphere import halves, seen_share
 from rangecheck.rigid import look_at
 from rangecheck.scan import RangeScan
+from rangecheck.scan.quality_sphere import counted
 from rangecheck.surface import MEASURED, Surface
 from rangecheck.surface.coarse import clustered
 from rangecheck.surface.distance import SurfaceDistance
@@ -96,7 +97,7 @@ def test_deviation_is_what_the_scans_say_against_the_surface():
 def test_one_scan_from_the_front_covers_the_front():
     camera = PinholeCamera.from_field_of_view(60, 60, 30.0)
     scan = RangeScan(np.full((60, 60), 200.0), camera, look_at((0.0, 0.0, 250.0), (0.0, 0.0, 0.0)))
-    counts = coverage([scan, scan], np.zeros(3))
+    counts = counted([scan.points_mm()] * 2, np.zeros(3))
     columns = counts.shape[1]
     assert counts.max() == 2
     assert not counts[:, columns // 4 : 3 * columns // 4].any()

@@ -27,8 +27,6 @@ MOST_FACES = 220_000
 _FIRST = 1 / 3600
 #: samples of the scans, and vertices of the real surface, that are compared
 _MOST_SAMPLES, _MOST_LOOKED_AT = 150_000, 100_000
-#: directions of the coverage sphere: rows of elevation, columns of azimuth
-COVERAGE_SHAPE = (36, 72)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,18 +140,3 @@ def _thickness(light: Surface) -> FloatArray:
         np.minimum.at(values, light.faces[:, corner], of_face)
     values[~np.isfinite(values)] = np.nan
     return values
-
-
-def coverage(scans: Sequence[RangeScan], middle_mm: FloatArray) -> IntArray:
-    """COVERAGE_SHAPE uint16: how many scans have a sample in each direction from `middle_mm`; rows from elevation +90 to -90 degrees,
-    columns from azimuth 0 (towards +z) through +90 (towards +x)."""
-    rows, columns = COVERAGE_SHAPE
-    counts = np.zeros(COVERAGE_SHAPE, np.uint16)
-    for scan in scans:
-        x, y, z = (scan.points_mm() - middle_mm).T
-        elevation = np.arctan2(y, np.hypot(x, z))
-        azimuth = np.arctan2(x, z) % (2 * np.pi)
-        row = np.clip((0.5 - elevation / np.pi) * rows, 0, rows - 1).astype(int)
-        column = np.clip(azimuth / (2 * np.pi) * columns, 0, columns - 1).astype(int)
-        counts += np.bincount(row * columns + column, minlength=rows * columns).reshape(COVERAGE_SHAPE) > 0
-    return counts

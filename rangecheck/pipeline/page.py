@@ -24,7 +24,7 @@ from rangecheck.export.pictures import png_bytes
 from rangecheck.files import read_bytes, read_json, whole_file, write_bytes
 from rangecheck.maps import trace_maps
 from rangecheck.optics import PinholeCamera
-from rangecheck.pipeline.likeness import coverage, likeness
+from rangecheck.pipeline.likeness import likeness
 from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.progress import Reporter
 from rangecheck.raycast import EmbreeCaster
@@ -41,6 +41,7 @@ from rangecheck.report import (
     write_report,
 )
 from rangecheck.scan import RangeScan
+from rangecheck.scan.quality_sphere import counted
 from rangecheck.scan.readers.limits import beside
 from rangecheck.solid import Verdict
 from rangecheck.surface import Surface
@@ -96,7 +97,7 @@ def keep_for_report(
         flagged=made.flagged,
         off_mm=np.array([made.off_mm, made.off_99_mm]),
         faces_before=np.array(made.faces),
-        coverage=coverage(scans, meshed.bounds_mm.mean(axis=0)),
+        coverage=counted([scan.points_mm() for scan in scans], meshed.bounds_mm.mean(axis=0)),
     )
     shrink = min(1.0, RING_PX / max(settings.picture.width, settings.picture.height))
     size = {key: max(8, round(shrink * getattr(settings.picture, key))) for key in ("width", "height")}

@@ -201,7 +201,7 @@ def _worth(
         ],
         "next_view": None if found.next_view is None else vars(found.next_view), "findings": [vars(f) for f in found.findings],
     }  # fmt: skip
-    return facts, [*found.lines, *_by_view(found)]
+    return facts, [*found.lines, *(f"  {line}" for line in found.drawing), *_by_view(found)]
 
 
 def _by_view(found: Any) -> list[str]:

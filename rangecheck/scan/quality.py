@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rangecheck import rigid
-from rangecheck.arrays import FloatArray, require, unit_vectors
+from rangecheck.arrays import FloatArray, IntArray, require, unit_vectors
 from rangecheck.errors import ScanError, SettingError
 from rangecheck.kernels import in_chunks
 from rangecheck.scan.quality_expected import expected
@@ -29,8 +29,10 @@ from rangecheck.scan.quality_space import (
     directions,
     gaps_of,
     shell_of,
+    upright_frame,
     views_from,
 )  # fmt: skip
+from rangecheck.scan.quality_sphere import LETTERS_SHAPE, counted, in_letters, legend
 from rangecheck.scan.range_scan import RangeScan
 from rangecheck.scan.registration.decide import judge_all
 from rangecheck.scan.registration.evidence import Pair, Rules
@@ -123,7 +125,7 @@ class ScanQuality:
     views        one per scan
     pairs        every pair of scans that share points, at the poses given
     height_mm    extent of the readings along `up`; `scale` from there to the print
-    coverage     share of the directions from the object's middle in which a sample lies
+    coverage     share of the directions from the object's middle in which a sample lies; `sphere` counts in each how many scans have one
     seen         share of the surface seen, of what can be seen from the allowed directions
     unseen_mm2   area of the frontier that can be seen from there, and `hidden_mm2` that cannot
     gaps         unseen pieces, the largest first; `mean_gap_mm` is the mean of the square roots of their areas, weighted by area
@@ -139,6 +141,7 @@ class ScanQuality:
     height_mm: float
     scale: float
     coverage: float
+    sphere: IntArray = field(repr=False)
     seen: float
     unseen_mm2: float
     hidden_mm2: float
@@ -168,6 +171,13 @@ class ScanQuality:
         if self.next_view is not None:
             lines.append(f"next view: {self.next_view.reason}")
         return lines
+
+    @property
+    def drawing(self) -> list[str]:
+        """The coverage sphere in letters, below what they mean."""
+        following = None if self.next_view is None else (self.next_view.azimuth_deg, self.next_view.elevation_deg)
+        stood = [(view.azimuth_deg, view.elevation_deg) for view in self.views]
+        return [legend(following is not None), *in_letters(self.sphere, stood, following)]
 
 
 def assess(
@@ -216,15 +226,18 @@ def assess(
     open_gaps = [g for g in gaps if g.reachable > 0.1]
     areas = np.array([g.area_mm2 for g in open_gaps])
 
-    points = np.concatenate([rigid.move_points(p, s.points_mm[s.usable]) for p, s in zip(poses, samples)])
+    clouds = [rigid.move_points(p, s.points_mm[s.usable]) for p, s in zip(poses, samples)]
+    points = np.concatenate(clouds)
     extent = points @ upward
     height = float(np.percentile(extent, 99.9) - np.percentile(extent, 0.1))
     views = tuple(_view(k, scans, samples, judged, middle, upward) for k in range(len(scans)))
     scale = wanted.height_mm / max(height, 1e-9)
     share = seen / max(seen + unseen, 1e-9)
+    upright = upright_frame(upward)
+    sphere = counted([cloud @ upright.T for cloud in clouds], upright @ middle, LETTERS_SHAPE)
     findings = _findings(views, wanted, scale, share, unseen, spacing, error, step, open_gaps, middle, upward)
     return ScanQuality(
-        views, tuple(p for p, *_ in judged.values() if p.overlap > 0), height, scale, _coverage(points, middle), share, unseen, hidden,
+        views, tuple(p for p, *_ in judged.values() if p.overlap > 0), height, scale, _coverage(points, middle), sphere, share, unseen, hidden,
         tuple(gaps), float(np.average(np.sqrt(areas), weights=areas)) if len(areas) else 0.0, spacing, error, step,
         _next_view(allowed, space, upward), wanted, tuple(findings),
     )  # fmt: skip

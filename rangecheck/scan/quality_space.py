@@ -290,8 +290,12 @@ def gaps_of(space: Space, shell: Shell, reachable: BoolArray) -> list[Gap]:
 
 def angles_deg(direction: FloatArray, up: FloatArray) -> tuple[float, float]:
     """Azimuth (0 where the world's z axis points, or x if that is upright; growing towards up x z) and elevation of a direction."""
+    x, y, z = upright_frame(up) @ direction
+    return math.degrees(math.atan2(x, z)), math.degrees(math.asin(np.clip(y, -1, 1)))
+
+
+def upright_frame(up: FloatArray) -> FloatArray:
+    """(3, 3) rows: where azimuth 90 degrees is, up, and where azimuth 0 is."""
     start = np.array([0.0, 0.0, 1.0]) if abs(up[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
     start = unit_vectors(start - (start @ up) * up)
-    side = np.cross(up, start)
-    elevation = math.degrees(math.asin(float(np.clip(direction @ up, -1, 1))))
-    return math.degrees(math.atan2(float(direction @ side), float(direction @ start))), elevation
+    return np.stack([np.cross(up, start), up, start])
