@@ -104,7 +104,13 @@ class BesideSource(_ByAllSources, caching.InTreeCacheLocator):
 
 
 class UserCache(_ByAllSources, caching.UserWideCacheLocator):
-    """In the user's cache folder."""
+    """In the user's cache folder, under the name of this package."""
+
+    _cache_path: str
+
+    def get_cache_path(self) -> str:
+        path = Path(self._cache_path)  # .../numba/folder_digest
+        return str(path.parents[1] / "rangecheck" / path.name)
 
 
 class _CompiledOnce(caching.FunctionCache):
@@ -162,7 +168,13 @@ class _CompiledOnce(caching.FunctionCache):
         return None
 
 
-_LOCATORS = ",".join(f"{__name__}.{locator.__name__}" for locator in (GivenFolder, BesideSource, UserCache))
+#: what is installed must leave nothing behind where it was, so that it keeps out of there while it can; a checkout keeps its own
+_PLACES: tuple[type[caching._CacheLocator], ...] = (
+    (GivenFolder, BesideSource, UserCache)
+    if (_PACKAGE.parent / "pyproject.toml").is_file()
+    else (GivenFolder, UserCache, BesideSource)
+)
+_LOCATORS = ",".join(f"{__name__}.{locator.__name__}" for locator in _PLACES)
 
 
 def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -190,6 +202,13 @@ inline_kernel = _compiled(inline="always")
 stage_kernel = _compiled(_nrt=False)
 #: the same, pasted by the compiler's back end, which costs less to compile: for what would hand whole queues over, ray by ray
 pasted_kernel = _compiled(_nrt=False, forceinline=True)
+
+
+def cache_folder(compiled: Any) -> Path | None:
+    """Where what is compiled of a kernel is kept; None where nothing can be, or nothing is compiled."""
+    path = getattr(getattr(compiled, "_cache", None), "cache_path", None)
+    return Path(path) if path else None
+
 
 _threads = 0
 _here = local()

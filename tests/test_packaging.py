@@ -1,5 +1,6 @@
 """What is installed is whole: a wheel works outside the checkout, with its presets, and a source archive makes the same wheel."""
 
+import os
 import shutil
 import subprocess
 import sys
@@ -7,6 +8,7 @@ import tarfile
 import zipfile
 from pathlib import Path
 
+import numpy
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -93,3 +95,25 @@ def test_the_wheel_works_outside_the_checkout(installed, tmp_path, sample_data):
     assert listed.returncode == 0 and "plaster" in listed.stdout
     done = _run(installed, tmp_path, "run", str(sample_data / "frontal"), "--dry-run", "--out", "out", "--config", "quick")
     assert done.returncode == 0, done.stderr
+
+
+COMPILE = """
+import numpy as np
+from rangecheck.surface.normals import area_vectors_into
+area_vectors_into(np.eye(3), np.array([[0, 1, 2]], np.int32), out := np.empty((1, 3)))
+assert abs(out - 0.5).max() < 1e-12
+"""
+
+
+def test_nothing_stays_behind_when_it_is_uninstalled_after_use(wheel, tmp_path):
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", "env"], cwd=tmp_path, check=True)
+    python, cache = tmp_path / "env" / "bin" / "python", tmp_path / "cache"
+    pip = [sys.executable, "-m", "pip", "--quiet", "--python", str(python)]
+    subprocess.run([*pip, "install", "--no-deps", "--no-index", str(wheel)], check=True)
+    # the packages that it needs are those of the tests; of these itself is not found, for it is not in that folder
+    around = {k: v for k, v in os.environ.items() if k not in ("NUMBA_CACHE_DIR", "NUMBA_DISABLE_JIT", "PYTHONDONTWRITEBYTECODE")}
+    around |= {"PYTHONPATH": str(Path(numpy.__file__).parents[1]), "XDG_CACHE_HOME": str(cache)}
+    subprocess.run([python, "-c", COMPILE], cwd=tmp_path, env=around, check=True)
+    assert list(cache.glob("rangecheck/*/normals.area_vectors_into*.nbi"))
+    subprocess.run([*pip, "uninstall", "--yes", "rangecheck"], check=True)
+    assert list((tmp_path / "env").rglob("rangecheck*")) == []

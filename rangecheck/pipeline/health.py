@@ -12,12 +12,13 @@ import platform
 import re
 import sys
 import tempfile
-from pathlib import Path
 
 from rangecheck import __version__, kernels
 from rangecheck.errors import RangecheckError
 from rangecheck.files import presets_folder
+from rangecheck.kernels import cache_folder
 from rangecheck.pipeline.outcome import Outcome, document
+from rangecheck.surface.normals import area_vectors_into
 
 #: import name -> (distribution, what it is for, needed by the main job, the line that installs it)
 PACKAGES = {
@@ -126,16 +127,10 @@ def _check_encoder(row) -> None:
 
 
 def _check_cache(row) -> None:
-    """numba keeps compiled kernels beside the source, else in the user's cache; where neither can be written, every start compiles."""
-    package = Path(__file__).resolve().parent
-    for folder in (Path(os.environ.get("NUMBA_CACHE_DIR", package)), Path.home() / ".cache"):
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=folder):
-                row("kernel cache", "ok", str(folder))
-                return
-        except OSError:
-            continue
+    """Compiled kernels are kept (see `kernels`), or compiled anew at every start where nothing can be written."""
+    if folder := cache_folder(area_vectors_into):
+        row("kernel cache", "ok", str(folder))
+        return
     row(
         "kernel cache",
         "missing",
