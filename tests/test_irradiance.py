@@ -147,7 +147,7 @@ def test_nodes_around_a_place_are_those_around_it():
     surface = floor(100.0)
     scene = Scene(surface, (WHITE,))
     caster = EmbreeCaster(surface.vertices, surface.faces)
-    nodes = nodes_of(geometry_of(scene, caster), caster.vertices, caster.faces, 100_000)
+    nodes = nodes_of(geometry_of(scene, caster), 100_000)
     u, v = np.random.default_rng(5).random((2, 500))
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
     u[:3], v[:3] = (0, 1, 0), (0, 0, 1)

@@ -1,6 +1,7 @@
 """Scenes: sources give the light that their closed forms say, surroundings shine as described, contradictions are refused."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from rangecheck.errors import SceneError
 from rangecheck.reflectance import GREY_UM, Material
 from rangecheck.scene import DARKNESS, Scene, Softbox, Source, constant, gradient, panorama, stripes, studio
 from rangecheck.surface import Surface
+from rangecheck.surface.surface import join
 
 PLASTER = Material("white", K_lm=0.9, wavelengths_um=GREY_UM)
 
@@ -141,6 +143,24 @@ def test_smooth_normals_are_the_vertices_and_flat_ones_the_faces():
     assert np.allclose(flat, np.repeat(surface.face_normals[:, None], 3, axis=1), atol=1e-6)
     smooth = Scene(surface, (PLASTER,), smooth=True).corner_normals
     assert np.allclose(smooth, surface.vertices[surface.faces] / (10 * math.sqrt(3)), atol=1e-6)
+
+
+def test_corners_that_no_vertex_speaks_for_have_the_normal_of_their_face():
+    flat, smooth = tetrahedron(), tetrahedron(20.0, centre=(50, 0, 0))
+    surface = join([replace(flat, part_names=("flat",)), replace(smooth, part_names=("smooth",))])
+    known = surface.vertex_normals.copy()
+    known[4] = 0.0  # of the smooth one
+    scene = Scene(surface, (PLASTER,), smooth_of_part=(False, True), vertex_normals=known)
+    for face, corners in enumerate(scene.corner_normals):
+        for vertex, normal in zip(surface.faces[face], corners):
+            own = face < 4 or vertex == 4
+            assert np.allclose(normal, surface.face_normals[face] if own else known[vertex], atol=1e-6)
+
+
+def test_the_normals_of_a_smooth_surface_are_kept_once_a_vertex():
+    surface = tetrahedron()
+    normals, rows = Scene(surface, (PLASTER,), smooth=True).shading_normals
+    assert len(normals) == len(surface.vertices) and np.shares_memory(rows, surface.faces)
 
 
 @pytest.mark.parametrize("kind", ["plaster", "steel", "stripes", "dark"])

@@ -8,6 +8,7 @@ from test_topology_distance import CUBE_CORNERS, CUBE_FACES, cube
 
 from rangecheck.surface import Surface
 from rangecheck.surface import topology as topo
+from rangecheck.surface.edges import every_edge_passed_both_ways
 from rangecheck.surface.surface import join
 
 
@@ -120,3 +121,13 @@ def test_no_faces_at_all():
     nothing = Surface(np.zeros((2, 3)), np.empty((0, 3), np.int32))
     assert [len(find(nothing)) for find in CULPRITS] == [0, 0, 0, 0, 0, 0, 2]
     assert topo.shells(nothing)[0] == 0 and len(topo.euler_numbers(nothing)) == 0 and not topo.is_closed(nothing)
+
+
+def test_edges_are_passed_both_ways_wherever_a_surface_has_no_rim_and_no_turned_face():
+    faces = np.asarray(CUBE_FACES, np.int32)
+    assert every_edge_passed_both_ways(faces, 8)
+    assert every_edge_passed_both_ways(np.concatenate([faces, faces, [[3, 3, 5], [2, 2, 2]]]).astype(np.int32), 8)
+    assert not every_edge_passed_both_ways(faces[:-1], 8)
+    turned = faces.copy()
+    turned[4] = turned[4, ::-1]
+    assert not every_edge_passed_both_ways(turned, 8)

@@ -36,10 +36,6 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
     "rtcCommitScene": (None, [_POINTER]),
     "rtcReleaseScene": (None, [_POINTER]),
     "rtcNewGeometry": (_POINTER, [_POINTER, ctypes.c_int]),
-    "rtcSetNewGeometryBuffer": (
-        _POINTER,
-        [_POINTER, ctypes.c_int, ctypes.c_uint, ctypes.c_int, ctypes.c_size_t, ctypes.c_size_t],
-    ),
     "rtcSetSharedGeometryBuffer": (
         None,
         [_POINTER, ctypes.c_int, ctypes.c_uint, ctypes.c_int, _POINTER, ctypes.c_size_t, ctypes.c_size_t, ctypes.c_size_t],
@@ -110,7 +106,8 @@ def _proved(library: ctypes.CDLL) -> bool:
     device = library.rtcNewDevice(b"threads=1")
     if not device or not _width(library, device):
         return False
-    corners = np.array([[0, 0, 0.5], [1, 0, 0.5], [0, 1, 0.5]], np.float32)
+    corners = with_room(3)
+    corners[:] = [[0, 0, 0.5], [1, 0, 0.5], [0, 1, 0.5]]
     tree = DirectScene(corners, np.array([[0, 1, 2]], np.int32), library, device)
     origins = np.tile(np.array([0.25, 0.5, -0.5], np.float32), (17, 1))
     origins[16, 0] = 2.0
@@ -146,12 +143,17 @@ def _commit(library: ctypes.CDLL, scene: int) -> None:
         _awake.append(library.rtcNewDevice(b"threads=2"))
 
 
-def _release(library: ctypes.CDLL, scene: int, faces: IntArray) -> None:
+def _release(library: ctypes.CDLL, scene: int, shared: tuple[FloatArray, IntArray]) -> None:
     library.rtcReleaseScene(scene)
 
 
+def with_room(count: int) -> FloatArray:
+    """(count, 3) float32 for vertices that Embree reads where they stand: 16 bytes at a time, so that there must be 4 after the last."""
+    return np.empty(3 * count + 1, np.float32)[:-1].reshape(-1, 3)
+
+
 class DirectScene:
-    """Triangles (n, 3) float32 local, (m, 3) int32 in one Embree scene."""
+    """Triangles (n, 3) float32 local from `with_room`, (m, 3) int32 in one Embree scene, which are read as long as it lives."""
 
     def __init__(
         self, vertices: FloatArray, faces: IntArray, library: ctypes.CDLL | None = None, device: int | None = None
@@ -162,20 +164,15 @@ class DirectScene:
         self._scene = library.rtcNewScene(device)
         library.rtcSetSceneFlags(self._scene, _ROBUST | (_COMPACT if len(faces) >= COMPACT_FROM else 0))
         geometry = library.rtcNewGeometry(device, _TRIANGLES)
-        content = np.ascontiguousarray(vertices)
-        place = library.rtcSetNewGeometryBuffer(geometry, _VERTEX_BUFFER, 0, _FLOAT3, 12, len(content))
-        if not place:
-            raise MemoryError
-        ctypes.memmove(place, content.ctypes.data, content.nbytes)
-        # indices are the larger part, and are read where they stand
-        self._faces = np.ascontiguousarray(faces)
-        library.rtcSetSharedGeometryBuffer(geometry, _INDEX_BUFFER, 0, _UINT3, self._faces.ctypes.data, 0, 12, len(self._faces))
+        self._shared = (vertices, np.ascontiguousarray(faces))
+        for kind, form, array in zip((_VERTEX_BUFFER, _INDEX_BUFFER), (_FLOAT3, _UINT3), self._shared):
+            library.rtcSetSharedGeometryBuffer(geometry, kind, 0, form, array.ctypes.data, 0, 12, len(array))
         library.rtcCommitGeometry(geometry)
         library.rtcAttachGeometry(self._scene, geometry)
         library.rtcReleaseGeometry(geometry)
         _commit(library, self._scene)
-        # the scene goes before the indices that it reads
-        weakref.finalize(self, _release, library, self._scene, self._faces)
+        # the scene goes before what it reads
+        weakref.finalize(self, _release, library, self._scene, self._shared)
         self._address = {
             name: ctypes.cast(getattr(library, name), _POINTER).value
             for name in ("rtcIntersect1", "rtcOccluded1", f"rtcIntersect{self._width}", f"rtcOccluded{self._width}")

@@ -22,6 +22,8 @@ from rangecheck.raycast import direct
 
 #: a hit nearer to grazing than this sine keeps Embree's distance: the plane of the face says nothing about it
 _GRAZING = 1e-4
+#: vertices that are brought into the local frame at once: of a large mesh a copy in double precision is much
+_AT_ONCE = 1 << 18
 
 
 class Hits(NamedTuple):
@@ -58,20 +60,25 @@ class EmbreeCaster:
         self.skin = float(64 * np.spacing(np.float32(1.0)))
         self.skin_mm = self.skin * self.scale_mm
         self._vertices_mm = np.ascontiguousarray(vertices_mm, np.float64)
-        self.faces = np.ascontiguousarray(faces, dtype=np.int32)
-        local = self.vertices.astype(np.float32)
-        self._direct = direct.DirectScene(local, self.faces) if direct.load() is not None else None
+        self.faces = np.ascontiguousarray(faces, dtype=np.int32).view()
+        self.faces.flags.writeable = False
+        #: (n, 3) float32, as Embree sees them
+        self.local = direct.with_room(len(vertices_mm))
+        for first in range(0, len(self.local), _AT_ONCE):
+            some = slice(first, first + _AT_ONCE)
+            self.local[some] = (self._vertices_mm[some] - self.centre_mm) / self.scale_mm
+        self._direct = direct.DirectScene(self.local, self.faces) if direct.load() is not None else None
         if self._direct is None:
             from embreex import mesh_construction, rtcore_scene
 
             self._scene = rtcore_scene.EmbreeScene()
-            self._mesh = mesh_construction.TriangleMesh(self._scene, local, self.faces)
+            self._mesh = mesh_construction.TriangleMesh(self._scene, self.local, self.faces)
             # the acceleration structure is built at the first query, which must not happen in two threads at once
             self._scene.run(np.zeros((1, 3), np.float32), np.array([[0, 0, 1]], np.float32))
 
     @property
     def vertices(self) -> FloatArray:
-        """(n, 3) local, made anew each time: of a large mesh a second copy is much."""
+        """(n, 3) `local` in double precision, made anew each time."""
         return (self._vertices_mm - self.centre_mm) / self.scale_mm
 
     def closest(self, origins_mm: FloatArray, directions: FloatArray, *, coherent: bool = False) -> Hits:

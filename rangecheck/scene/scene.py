@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,8 +15,16 @@ from rangecheck.reflectance import Material
 from rangecheck.scene.sources import Source
 from rangecheck.scene.surroundings import DARKNESS, Surroundings
 from rangecheck.surface import Surface
-from rangecheck.surface.normals import corner_normals_into
+from rangecheck.surface.normals import faces_apart, point_at_own
 from rangecheck.surface.surface import FACES_AT_ONCE
+
+
+class ShadingNormals(NamedTuple):
+    """normals (k, 3) float32 unit vectors; row_of_corner (m, 3) int32, not to be written to: which of them each face's corners have. Where all is
+    smooth these are the vertices' and the faces themselves, so that a large mesh takes no more."""
+
+    normals: FloatArray
+    row_of_corner: IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,27 +107,45 @@ class Scene:
         """(m,) int16 index into `materials`."""
         return np.asarray(self.material_of_part, np.int16)[self.surface.part_of_face]
 
-    @cached_property
+    @property
     def corner_normals(self) -> FloatArray:
-        """(m, 3, 3) float32 unit normals at each face's corners: the vertices' where smooth, else the face's own; faces without
-        area get +z, which no ray ever sees."""
-        normals = np.empty((len(self.surface.faces), 3, 3), np.float32)
+        """(m, 3, 3) float32 unit normals at each face's corners, as of `shading_normals`; made anew each time."""
+        normals, rows = self.shading_normals
+        return normals[rows]
+
+    @cached_property
+    def shading_normals(self) -> ShadingNormals:
+        """The normals to shade with: the vertices' where smooth, else the face's own; faces without area get +z, which no ray ever sees."""
         smooth = np.asarray(self.smooth_of_part or (self.smooth,) * len(self.surface.part_names))[self.surface.part_of_face]
         known = self.vertex_normals
         if known is None:
             large = len(self.surface.faces) > FACES_AT_ONCE
             of_vertices = self.surface.made_vertex_normals if large else lambda: self.surface.vertex_normals
-            known = of_vertices() if smooth.any() else np.zeros((0, 3))
-        if known.ndim == 2:
-            for piece in self.surface.pieces():
-                corner_normals_into(
-                    self.surface.faces[piece], self.surface.normals_of(piece), smooth[piece], known, normals[piece]
-                )
-            return normals
-        flat = np.nan_to_num(self.surface.face_normals)
-        flat[(flat == 0).all(axis=1)] = (0.0, 0.0, 1.0)
-        blank = ~smooth[:, None, None] | (known == 0).all(axis=-1, keepdims=True)
-        normals[:] = np.where(blank, flat[:, None, :], known)
+            known = of_vertices() if smooth.any() else np.zeros((len(self.surface.vertices), 3))
+        if known.ndim == 3:
+            blank = ~smooth[:, None, None] | (known == 0).all(axis=-1, keepdims=True)
+            own = self._flat_normals(np.arange(len(known)))
+            normals = np.where(blank, own[:, None, :], known).astype(np.float32).reshape(-1, 3)
+            rows: IntArray = np.arange(len(normals), dtype=np.int32).reshape(-1, 3)
+        else:
+            faces = rows = self.surface.faces
+            chosen = np.flatnonzero(faces_apart(faces, smooth, known))
+            normals = known.astype(np.float32) if smooth.any() else np.empty((0, 3), np.float32)
+            if len(chosen):
+                rows = faces.copy()
+                point_at_own(faces, chosen, smooth, known, len(normals), rows)
+                normals = np.concatenate([normals, self._flat_normals(chosen)])
+        rows = rows.view()
+        rows.flags.writeable = False
+        return ShadingNormals(normals, rows)
+
+    def _flat_normals(self, chosen: IntArray) -> FloatArray:
+        """(k, 3) float32 normals of faces, +z for those without area."""
+        normals = np.empty((len(chosen), 3), np.float32)
+        for first in range(0, len(chosen), FACES_AT_ONCE):
+            some = slice(first, first + FACES_AT_ONCE)
+            own = self.surface.normals_of(chosen[some])
+            normals[some] = np.where(np.isnan(own[:, :1]), (0.0, 0.0, 1.0), own)
         return normals
 
     def at(self, wavelengths_um: Sequence[float]) -> Scene:

@@ -148,7 +148,9 @@ def _wrong(recentred: bool, count: int, offset_mm: float) -> float:
         origins = points + shift + [0.0, caster.skin_mm, 0.0]
         return float((caster.occluded(origins, towards, 600.0) != hidden).mean())
     # the same engine and skin, fed with the world's own coordinates
-    tree = direct.DirectScene(np.ascontiguousarray(vertices, np.float32), surface.faces)
+    local = direct.with_room(len(vertices))
+    local[:] = vertices
+    tree = direct.DirectScene(local, surface.faces)
     origins = np.empty_like(points)
     _lifted(points + shift, 64 * float(np.spacing(np.float32(200.0))), origins)
     blocked = np.empty(len(points), np.bool_)

@@ -137,6 +137,39 @@ def grouped_half_edges(faces, halves, low, high):
 
 
 @kernel
+def every_edge_passed_both_ways(faces, vertex_count):
+    """Whether as many faces run along every edge one way as the other; without a table of the edges, which of a large mesh is much."""
+    at = np.zeros(vertex_count + 1, np.int64)
+    for f in range(len(faces)):
+        for side in range(3):
+            at[min(faces[f, side], faces[f, (side + 1) % 3]) + 1] += 1
+    for v in range(vertex_count):
+        at[v + 1] += at[v]
+    # the other end, and in the last bit which way; those of one lower end together
+    passes = np.empty(at[vertex_count], np.uint32)
+    for f in range(len(faces)):
+        for side in range(3):
+            p, q = faces[f, side], faces[f, (side + 1) % 3]
+            low = min(p, q)
+            passes[at[low]] = 2 * max(p, q) + (1 if p < q else 0)
+            at[low] += 1
+    first = 0
+    for v in range(vertex_count):
+        own = passes[first : at[v]]
+        first = at[v]
+        own.sort()
+        balance = 0
+        for i in range(len(own)):
+            balance += 1 if own[i] & 1 else -1
+            if own[i] >> 1 != v and (i + 1 == len(own) or own[i + 1] >> 1 != own[i] >> 1):
+                if balance != 0:
+                    return False
+            elif own[i] >> 1 == v:
+                balance = 0
+    return True
+
+
+@kernel
 def root_of(parent, i):
     """Root of the set that i belongs to, its lowest member; paths are halved on the way."""
     while parent[i] != i:

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from rangecheck.kernels import inline_kernel, kernel
 
 
@@ -54,17 +56,27 @@ def angle_weighted_into(vertices, faces, face_normals, normals):
             normals[vertex, 2] += angle * nz
 
 
+@inline_kernel
+def _blank(vertex_normals, vertex):
+    return vertex_normals[vertex, 0] == 0.0 and vertex_normals[vertex, 1] == 0.0 and vertex_normals[vertex, 2] == 0.0
+
+
 @kernel
-def corner_normals_into(faces, face_normals, smooth, vertex_normals, normals):
-    """(m, 3, 3) float32: at each corner the vertex's normal where `smooth` and known, else the face's; +z for faces without area."""
+def faces_apart(faces, smooth, vertex_normals):
+    """(m,) bool: faces that need a normal of their own, for not being smooth or for a vertex whose normal is not known."""
+    apart = np.empty(len(faces), np.bool_)
     for face in range(len(faces)):
-        x, y, z = face_normals[face, 0], face_normals[face, 1], face_normals[face, 2]
-        if math.isnan(x):
-            x, y, z = 0.0, 0.0, 1.0
+        apart[face] = not smooth[face]
         for corner in range(3):
-            normals[face, corner, 0], normals[face, corner, 1], normals[face, corner, 2] = x, y, z
-            if smooth[face]:
-                vertex = faces[face, corner]
-                if vertex_normals[vertex, 0] != 0.0 or vertex_normals[vertex, 1] != 0.0 or vertex_normals[vertex, 2] != 0.0:
-                    for axis in range(3):
-                        normals[face, corner, axis] = vertex_normals[vertex, axis]
+            apart[face] = apart[face] or _blank(vertex_normals, faces[face, corner])
+    return apart
+
+
+@kernel
+def point_at_own(faces, chosen, smooth, vertex_normals, first, rows):
+    """In rows (m, 3) the corners of `chosen` faces that have no vertex's normal to shade with name the face's own: row first + its place among the chosen."""
+    for k in range(len(chosen)):
+        face = chosen[k]
+        for corner in range(3):
+            if not smooth[face] or _blank(vertex_normals, faces[face, corner]):
+                rows[face, corner] = first + k

@@ -1,5 +1,5 @@
-"""A scene as the compiled stages read it: everything in the caster's local frame (centred, scaled to the object), corner data
-face by face so that one hit touches one place in memory."""
+"""A scene as the compiled stages read it: everything in the caster's local frame (centred, scaled to the object). Corners are read by
+vertex: of a mesh of 20 million faces copies face by face would be more than all else."""
 
 from __future__ import annotations
 
@@ -15,13 +15,23 @@ from rangecheck.scene import Scene
 
 
 class Geometry(NamedTuple):
-    """corners, normals (m, 9) float32: three points, three unit normals; material (m,) int16; skin: how far a ray starts off
-    the face that it leaves."""
+    """vertices (n, 3) float32; faces (m, 3) int32; normals (k, 3) float32 and of which of these each corner has one, rows (m, 3) int32;
+    material (m,) int16; skin: how far a ray starts off the face that it leaves."""
 
-    corners: FloatArray
+    vertices: FloatArray
+    faces: IntArray
     normals: FloatArray
+    rows: IntArray
     material: IntArray
     skin: float
+
+    def corners(self, face: IntArray | slice) -> FloatArray:
+        """(k, 3, 3) float32 corners of some faces."""
+        return self.vertices[self.faces[face]]
+
+    def corner_normals(self, face: IntArray | slice) -> FloatArray:
+        """(k, 3, 3) float32 normals at the corners of some faces."""
+        return self.normals[self.rows[face]]
 
 
 class SourceArrays(NamedTuple):
@@ -34,10 +44,12 @@ class SourceArrays(NamedTuple):
 
 def geometry_of(scene: Scene, caster: EmbreeCaster) -> Geometry:
     """The scene's faces in the local frame of `caster`."""
-    faces = len(caster.faces)
+    normals, rows = scene.shading_normals
     return Geometry(
-        corners=np.take(caster.vertices.astype(np.float32), caster.faces, axis=0).reshape(faces, 9),
-        normals=np.ascontiguousarray(scene.corner_normals.reshape(faces, 9)),
+        vertices=caster.local,
+        faces=caster.faces,
+        normals=normals,
+        rows=rows,
         material=np.ascontiguousarray(scene.material_of_face),
         skin=caster.skin,
     )
@@ -60,21 +72,23 @@ def dot(ax, ay, az, bx, by, bz):
 
 
 @inline_kernel
-def place_hit(corners, normals, skin, face, u, v, dx, dy, dz, place, shading, facing, i):
+def place_hit(vertices, faces, normals, rows, skin, face, u, v, dx, dy, dz, place, shading, facing, i):
     """Where ray (dx, dy, dz) met `face` at (u, v): row i of `place` (a skin off the face), `shading` and `facing` (its own)
     normal, both turned against the ray.
 
     With smooth normals the place is lifted to the rounded surface that they describe, so that a coarse mesh does not shade itself in
     facets where light grazes it (Hanika, *Hacking the shadow terminator*, 2021); on flat faces nothing is lifted."""
     w = 1.0 - u - v
-    ax, ay, az = float(corners[face, 0]), float(corners[face, 1]), float(corners[face, 2])
-    ex, ey, ez = corners[face, 3] - ax, corners[face, 4] - ay, corners[face, 5] - az
-    fx, fy, fz = corners[face, 6] - ax, corners[face, 7] - ay, corners[face, 8] - az
+    a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+    ax, ay, az = float(vertices[a, 0]), float(vertices[a, 1]), float(vertices[a, 2])
+    ex, ey, ez = vertices[b, 0] - ax, vertices[b, 1] - ay, vertices[b, 2] - az
+    fx, fy, fz = vertices[c, 0] - ax, vertices[c, 1] - ay, vertices[c, 2] - az
     x, y, z = ax + u * ex + v * fx, ay + u * ey + v * fy, az + u * ez + v * fz
     gx, gy, gz = ey * fz - ez * fy, ez * fx - ex * fz, ex * fy - ey * fx
-    sx = w * normals[face, 0] + u * normals[face, 3] + v * normals[face, 6]
-    sy = w * normals[face, 1] + u * normals[face, 4] + v * normals[face, 7]
-    sz = w * normals[face, 2] + u * normals[face, 5] + v * normals[face, 8]
+    p, q, r = rows[face, 0], rows[face, 1], rows[face, 2]
+    sx = w * normals[p, 0] + u * normals[q, 0] + v * normals[r, 0]
+    sy = w * normals[p, 1] + u * normals[q, 1] + v * normals[r, 1]
+    sz = w * normals[p, 2] + u * normals[q, 2] + v * normals[r, 2]
     # the face's own normal agrees with its corners' on which side is out
     turn = 1.0 if dot(gx, gy, gz, dx, dy, dz) < 0.0 else -1.0
     size = turn / math.sqrt(dot(gx, gy, gz, gx, gy, gz))
@@ -89,10 +103,10 @@ def place_hit(corners, normals, skin, face, u, v, dx, dy, dz, place, shading, fa
         size = 1.0 / math.sqrt(dot(sx, sy, sz, sx, sy, sz))
         sx, sy, sz = sx * size, sy * size, sz * size
     lx = ly = lz = 0.0
-    for k in range(0, 9, 3):
-        share = w if k == 0 else (u if k == 3 else v)
-        nx, ny, nz = turn * normals[face, k], turn * normals[face, k + 1], turn * normals[face, k + 2]
-        below = min(0.0, dot(x - corners[face, k], y - corners[face, k + 1], z - corners[face, k + 2], nx, ny, nz))
+    for k in range(3):
+        share, at, row = w if k == 0 else (u if k == 1 else v), faces[face, k], rows[face, k]
+        nx, ny, nz = turn * normals[row, 0], turn * normals[row, 1], turn * normals[row, 2]
+        below = min(0.0, dot(x - vertices[at, 0], y - vertices[at, 1], z - vertices[at, 2], nx, ny, nz))
         lx, ly, lz = lx - share * below * nx, ly - share * below * ny, lz - share * below * nz
     place[i, 0], place[i, 1], place[i, 2] = x + lx + skin * gx, y + ly + skin * gy, z + lz + skin * gz
     shading[i, 0], shading[i, 1], shading[i, 2] = sx, sy, sz

@@ -69,27 +69,16 @@ def corner_places(glint_pixel, n, width, cells, places):
 @stage_kernel
 def mirrored_corners(geometry, rays, n, hits, places, directions):
     """Places and mirror directions (n, 3) of cast corner rays; NaN where they met nothing. `hits` is scratch of at least one row."""
-    corners, normals, _, skin = geometry
+    vertices, faces, normals, rows, _, skin = geometry
     for i in range(n):
         if rays.face[i] < 0:
             directions[i, 0] = directions[i, 1] = directions[i, 2] = math.nan
             continue
         dx, dy, dz = float(rays.direction[i, 0]), float(rays.direction[i, 1]), float(rays.direction[i, 2])
         place_hit(
-            corners,
-            normals,
-            skin,
-            rays.face[i],
-            float(rays.u[i]),
-            float(rays.v[i]),
-            dx,
-            dy,
-            dz,
-            hits.place,
-            hits.shading,
-            hits.facing,
-            0,
-        )
+            vertices, faces, normals, rows, skin, rays.face[i], float(rays.u[i]), float(rays.v[i]), dx, dy, dz,
+            hits.place, hits.shading, hits.facing, 0,
+        )  # fmt: skip
         for axis in range(3):
             hits.arriving[0, axis] = rays.direction[i, axis]
         directions[i, 0], directions[i, 1], directions[i, 2] = mirror_ray(hits, 0)

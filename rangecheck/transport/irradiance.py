@@ -25,7 +25,8 @@ from rangecheck.arrays import BoolArray, FloatArray, IntArray
 from rangecheck.errors import SceneError
 from rangecheck.kernels import in_chunks, thread_count
 from rangecheck.reflectance import Material
-from rangecheck.transport.irradiance_nodes import Nodes, nodes_of
+from rangecheck.surface.edges import every_edge_passed_both_ways
+from rangecheck.transport.irradiance_nodes import areas, joined, nodes_of, pieces
 from rangecheck.transport.irradiance_stages import look_out, look_up, mix, see_sky, stand, sum_up
 from rangecheck.transport.light import add_light, aim
 from rangecheck.transport.queues import KIND_NAMES, LOBE, new_hits, new_rays, new_shadows
@@ -104,9 +105,9 @@ class IrradianceCache:
 
 def nothing_stored(channels: int) -> Stored:
     """A cache in which nothing is found."""
-    return Stored(
-        np.empty((0, 3), np.int32), np.empty(0, np.int32), np.empty((0, channels), np.float32), np.empty((0, channels)), 0, np.empty(0)
-    )  # fmt: skip
+    faces = np.empty((0, 3), np.int32)
+    faces.flags.writeable = False  # as those of every cache are, so that stages are compiled once
+    return Stored(faces, np.empty(0, np.int32), np.empty((0, channels), np.float32), np.empty((0, channels)), 0, np.empty(0))
 
 
 def may_be_cached(tracer: Tracer) -> bool:
@@ -135,19 +136,23 @@ class _Gathering:
     def __init__(self, tracer: Tracer, depth: int, records: int, shadow_rays: int, seed: int) -> None:
         self.tracer, self.depth, self.records, self.shadow_rays, self.seed = tracer, depth, records, shadow_rays, seed
         self.channels = tracer.scene.channels
-        nodes = nodes_of(tracer.geometry, tracer.caster.vertices, tracer.caster.faces, _NODES_PER_RECORD * records)
-        self.sides = 1 if _is_closed(tracer.caster.faces) else 2
+        nodes = nodes_of(tracer.geometry, _NODES_PER_RECORD * records)
+        closed = every_edge_passed_both_ways(tracer.geometry.faces, len(tracer.geometry.vertices))
+        self.sides = 1 if closed else 2  # of a closed surface only one side is ever seen from outside
         self.node_of_face, self.steps = nodes.node_of_face, nodes.steps
-        self.place = np.concatenate([nodes.place] * self.sides)
-        self.normal = np.concatenate([nodes.normal, -nodes.normal][: self.sides])
+        self.place = joined([nodes.place] * self.sides)
+        self.normal = joined([nodes.normal] if closed else [nodes.normal, -nodes.normal])
         self.albedo = np.stack([m.strengths()[0] for m in tracer.scene.materials])
-        self.direct, by_source = self._direct_light(nodes)
-        corners = tracer.geometry.corners.reshape(-1, 3, 3).astype(np.float64)
-        self.area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        self.direct, by_source = self._direct_light()
         self.by_light = np.append(by_source, 0.0)
 
+    def _areas(self) -> FloatArray:
+        """(m,) of the faces, not kept."""
+        geometry = self.tracer.geometry
+        return np.concatenate([areas(geometry.corners(some).astype(np.float64)) for some in pieces(len(geometry.faces))])
+
     def until(self, error: float) -> IrradianceCache:
-        spacing = math.sqrt(self.sides * float(self.area.sum()) / self.records)
+        spacing = math.sqrt(self.sides * float(self._areas().sum()) / self.records)
         everywhere = np.arange(len(self.place))
         chosen, met = np.empty(0, np.int64), _nothing_met(self.channels)
         candidates, step = everywhere, spacing
@@ -175,7 +180,7 @@ class _Gathering:
         for _ in range(1, self.depth):
             reflections += 1
             brighter = _interpolated(near, weight, self._sum(met, light))
-            step = float(np.sqrt(((brighter - light).astype(np.float64) ** 2).mean()))
+            step = float(np.sqrt(np.square(brighter - light, dtype=np.float64).mean()))
             light = brighter
             if step <= _CONVERGED * total:
                 break
@@ -195,7 +200,7 @@ class _Gathering:
         total = kept + float(straight.sum())
         return (shares * kept + straight) / total if total > 0 else shares
 
-    def _direct_light(self, nodes: Nodes) -> tuple[FloatArray, FloatArray]:
+    def _direct_light(self) -> tuple[FloatArray, FloatArray]:
         """(n, c) float32 radiance of white nodes in the light of the sources alone; (sources,) how much of it is whose."""
         tracer, n = self.tracer, len(self.place)
         light, sources = np.zeros((n, self.channels), np.float32), len(tracer.sources.radius)
@@ -220,22 +225,27 @@ class _Gathering:
 
     def _cells(self, nodes: IntArray, step: float) -> IntArray:
         """(k,) which cube of side `step`, and which main direction of the normal, each node belongs to."""
-        place, normal = self.place[nodes], self.normal[nodes]
-        cube = np.floor(place / step).astype(np.int64)
-        axis = np.abs(normal).argmax(axis=1)
-        turn = 2 * axis + (normal[np.arange(len(axis)), axis] < 0)
-        return ((cube[:, 0] * 2097152 + cube[:, 1]) * 2097152 + cube[:, 2]) * 6 + turn
+        cells = np.empty(len(nodes), np.int64)
+        for some in pieces(len(nodes)):
+            place, normal = self.place[nodes[some]], self.normal[nodes[some]]
+            cube = np.floor(place / step).astype(np.int64)
+            axis = np.abs(normal).argmax(axis=1)
+            turn = 2 * axis + (normal[np.arange(len(axis)), axis] < 0)
+            cells[some] = ((cube[:, 0] * 2097152 + cube[:, 1]) * 2097152 + cube[:, 2]) * 6 + turn
+        return cells
 
     def _one_in_each(self, cells: IntArray, nodes: IntArray, step: float) -> IntArray:
         """Rows of one node of every cell, the one nearest to its middle."""
-        aside = np.square((self.place[nodes] / step) % 1.0 - 0.5).sum(axis=1)
+        aside = np.empty(len(nodes), np.float32)
+        for some in pieces(len(nodes)):
+            aside[some] = np.square((self.place[nodes[some]] / step) % 1.0 - 0.5).sum(axis=1)
         order = np.lexsort((aside, cells))
         return np.sort(order[np.append(True, np.diff(cells[order]) != 0)])
 
     def _disagreement(self, met: _Met, chosen: IntArray, spacing: float) -> FloatArray:
         """(records,) how far the light that each sees is from what the others would have it see, relative to the mean light."""
         seen = self._sum(met, np.zeros_like(self.direct))
-        near, weight = self._nearest(chosen, chosen, spacing, _NEIGHBOURS + 1)
+        near, weight = self._nearest(chosen, spacing, _NEIGHBOURS + 1)(chosen)
         weight = np.where(near == np.arange(len(chosen))[:, None], 0, weight)
         total = weight.sum(axis=1, keepdims=True)
         others = (weight[..., None] * seen[near]).sum(axis=1) / np.maximum(total, 1e-30)
@@ -245,20 +255,31 @@ class _Gathering:
 
     def _neighbours(self, chosen: IntArray, spacing: float) -> tuple[IntArray, FloatArray]:
         """(n, k) int32 rows of the records nearest to every node, and (n, k) float32 weights that sum to 1."""
-        near, weight = self._nearest(chosen, np.arange(len(self.place)), spacing, _NEIGHBOURS)
-        return near.astype(np.int32), (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
+        k = min(_NEIGHBOURS, len(chosen))
+        near, weight = np.empty((len(self.place), k), np.int32), np.empty((len(self.place), k), np.float32)
+        nearest = self._nearest(chosen, spacing, _NEIGHBOURS)
+        for some in pieces(len(near)):
+            near[some], own = nearest(np.arange(len(near))[some])
+            weight[some] = own / own.sum(axis=1, keepdims=True)
+        return near, weight
 
-    def _nearest(self, chosen: IntArray, nodes: IntArray, spacing: float, count: int) -> tuple[IntArray, FloatArray]:
-        """(k, count) rows of the records nearest to these nodes by place and normal, and weights that fall from all to 0
+    def _nearest(self, chosen: IntArray, spacing: float, count: int) -> Callable[[IntArray], tuple[IntArray, FloatArray]]:
+        """Tells of nodes (n,) the rows (n, count) of the records nearest to them by place and normal, and weights that fall from all to 0
         at the last (Franke & Little's form of Shepard's)."""
         from scipy.spatial import cKDTree
 
-        where = np.hstack([self.place / spacing, self.normal / _TURN])
-        k = min(count, len(chosen))
-        distance, near = cKDTree(where[chosen]).query(where[nodes], k=k, workers=thread_count())
-        distance, near = distance.reshape(len(nodes), k), near.reshape(len(nodes), k)
-        reach = 1.001 * distance[:, -1:] + 1e-9
-        return near, np.square((reach - distance) / (reach * (distance + _SELF)))
+        def where(nodes: IntArray) -> FloatArray:
+            return np.hstack([self.place[nodes] / spacing, self.normal[nodes] / _TURN])
+
+        tree, k = cKDTree(where(chosen)), min(count, len(chosen))
+
+        def nearest(nodes: IntArray) -> tuple[IntArray, FloatArray]:
+            distance, near = tree.query(where(nodes), k=k, workers=thread_count())
+            distance, near = distance.reshape(len(nodes), k), near.reshape(len(nodes), k)
+            reach = 1.001 * distance[:, -1:] + 1e-9
+            return near, np.square((reach - distance) / (reach * (distance + _SELF)))
+
+        return nearest
 
     def _look(self, place: FloatArray, normal: FloatArray, rays: int, seed: int, first: int = 0) -> _Met:
         """What `rays` from each place meet; places count from `first`, by which their chance is told apart."""
@@ -278,14 +299,14 @@ class _Gathering:
                 )
             face, u, v = met.face[own], met.u[own], met.v[own]
             tracer.caster.closest_local(queue.origin, queue.direction, queue.far, face, u, v)
-            see_sky(sky, tracer.geometry.normals, tracer.geometry.corners, queue, rays, self.sides, face, met.sky[start:stop])
+            see_sky(sky, tracer.geometry, queue, rays, face, met.sky[start:stop])
 
         in_chunks(some, n, max(1, _RECORDS_AT_ONCE * RAYS // rays))
         return met
 
     def _sum(self, met: _Met, light: FloatArray) -> FloatArray:
         """(records, c) float32: what they see if the nodes have this light beside that of the sources."""
-        total = (self.direct + light).astype(np.float32)
+        total = self.direct + light
         seen = np.empty_like(met.sky)
         materials = self.tracer.geometry.material
 
@@ -302,14 +323,14 @@ class _Gathering:
     def _error(self, stored: Stored) -> float:
         """What interpolation is off by, from places anywhere on the surface, as many where there is more of it."""
         chance = np.random.default_rng([self.seed, 0x1CACE])
-        places = min(_PILOTS, 4 * len(self.area))
-        edges = np.cumsum(self.area)
+        edges = np.cumsum(self._areas())
+        places = min(_PILOTS, 4 * len(edges))
         face = np.searchsorted(edges, (np.arange(places) + chance.random(places)) / places * edges[-1]).clip(0, len(edges) - 1)
+        del edges
         u, v = chance.random((2, places))
         u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
         back = chance.random(places) < (0.5 if self.sides == 2 else 0.0)
-        corners = self.tracer.geometry.corners.reshape(-1, 3, 3)[face]
-        normals = self.tracer.geometry.normals.reshape(-1, 3, 3)[face]
+        corners, normals = self.tracer.geometry.corners(face), self.tracer.geometry.corner_normals(face)
         weights = np.stack([1 - u - v, u, v], axis=1)[:, :, None]
         place = np.ascontiguousarray((weights * corners).sum(axis=1), np.float32)
         normal = (weights * normals).sum(axis=1)
@@ -333,7 +354,7 @@ class _Gathering:
     ) -> FloatArray:
         """(2, n, c) how far what is kept at places (u, v) of faces, on their `back` or front side, is from what is gathered there along
         unit normals (n, 3): twice, with independent chance. Radiance of a white surface."""
-        corners = self.tracer.geometry.corners.reshape(-1, 3, 3)[face]
+        corners = self.tracer.geometry.corners(face)
         weights = np.stack([1 - u - v, u, v], axis=1)[:, :, None]
         place = np.ascontiguousarray((weights * corners).sum(axis=1), np.float32)
         kept, straight = (np.empty((len(face), self.channels), np.float32) for _ in range(2))
@@ -363,17 +384,6 @@ def _nothing_met(channels: int) -> _Met:
     return _Met(
         np.empty(0, np.int32), np.empty(0, np.float32), np.empty(0, np.float32), np.empty((0, channels), np.float32), RAYS
     )
-
-
-def _is_closed(faces: IntArray) -> bool:
-    """Whether every edge is passed as often one way as the other: then only one side is ever seen from outside."""
-    a = faces.astype(np.int64)
-    b = np.roll(a, -1, axis=1)
-    size = int(faces.max()) + 1
-    forward, backward = (a * size + b).ravel(), (b * size + a).ravel()
-    forward.sort()
-    backward.sort()
-    return bool((forward == backward).all())
 
 
 def _interpolated(near: IntArray, weight: FloatArray, light: FloatArray) -> FloatArray:

@@ -7,6 +7,7 @@ together. A larger face carries a triangular lattice of nodes of its own. Places
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,8 @@ _MOST_APART = 400_000
 _SHARING_DEG = (5.0, 15.0, 40.0)
 #: nodes of a face stand so much of a cell inside it, where rays are clear of the walls that meet at its edges
 _INSIDE = 0.05
+#: faces or nodes that are looked at together
+_AT_ONCE = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,71 +38,101 @@ class Nodes:
     spacing: float
 
 
-def nodes_of(geometry: Geometry, vertices: FloatArray, faces: IntArray, most: int) -> Nodes:
-    """Nodes of the faces (m, 3) over local vertices (n, 3), at most `most` of them on lattices."""
-    corners = geometry.corners.reshape(-1, 3, 3)
-    normals = geometry.normals.reshape(-1, 3, 3)
-    edges = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).max(axis=1)
-    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+def nodes_of(geometry: Geometry, most: int) -> Nodes:
+    """Nodes of the faces, at most `most` of them on lattices."""
+    faces = geometry.faces
+    edges, area = (np.empty(len(faces), np.float32) for _ in range(2))
+    for some in pieces(len(faces)):
+        corners = geometry.corners(some)
+        edges[some] = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).max(axis=1)
+        area[some] = areas(corners)
     spacing = max(math.sqrt(float(area.sum(dtype=np.float64)) / (0.25 * most)), 1e-6)
+    del area
     while True:
-        steps = np.maximum(1, np.ceil(edges / spacing)).astype(np.int64)
-        large = steps > 1
-        if int(((steps[large] + 1) * (steps[large] + 2) // 2).sum()) <= most:
+        steps = np.maximum(1, np.ceil(edges / spacing)).astype(np.int32)
+        chosen = np.flatnonzero(steps > 1)
+        sizes = (steps[chosen].astype(np.int64) + 1) * (steps[chosen].astype(np.int64) + 2) // 2
+        if int(sizes.sum()) <= most:
             break
         spacing *= 1.5
-    small = np.flatnonzero(~large)
-    places, facing, node_of_face = [vertices.astype(np.float32)], [_vertex_normals(normals, faces, len(vertices))], faces.copy()
-    count = len(vertices)
-    apart = _apart(normals[small], facing[0][faces[small]])
-    if apart.any():
-        face, corner = small[np.nonzero(apart)[0]], np.nonzero(apart)[1]
-        own = corners[face, corner]
-        places.append(own + np.float32(_INSIDE) * (corners[face].mean(axis=1) - own))
-        facing.append(normals[face, corner])
+    del edges
+    shared = _vertex_normals(geometry)
+    places, facing, node_of_face = [geometry.vertices], [shared], faces
+    count = len(geometry.vertices)
+    face, corner = _apart(geometry, shared, steps)
+    if len(face) or len(chosen):
+        node_of_face = faces.copy()
+    if len(face):
+        own = geometry.vertices[faces[face, corner]]
+        places.append(own + np.float32(_INSIDE) * (geometry.corners(face).mean(axis=1) - own))
+        facing.append(geometry.normals[geometry.rows[face, corner]])
         node_of_face[face, corner] = count + np.arange(len(face), dtype=np.int32)
         count += len(face)
-    chosen = np.flatnonzero(large)
     if len(chosen):
-        sizes = (steps[chosen] + 1) * (steps[chosen] + 2) // 2
         starts = np.concatenate([[0], np.cumsum(sizes)])
         place, normal = np.empty((starts[-1], 3), np.float32), np.empty((starts[-1], 3), np.float32)
-        _fill_lattices(corners, normals, chosen, steps, starts, place, normal)
+        _fill_lattices(geometry.corners(chosen), geometry.corner_normals(chosen), steps[chosen], starts, place, normal)
         places.append(place)
         facing.append(normal)
         node_of_face[chosen, 0] = count + starts[:-1]
-    return Nodes(
-        np.ascontiguousarray(np.concatenate(places)),
-        np.ascontiguousarray(np.concatenate(facing)),
-        np.ascontiguousarray(node_of_face, np.int32),
-        steps.astype(np.int32),
-        spacing,
-    )
+    node_of_face = node_of_face.view()
+    node_of_face.flags.writeable = False
+    return Nodes(joined(places), joined(facing), node_of_face, steps, spacing)
 
 
-def _vertex_normals(normals: FloatArray, faces: IntArray, vertices: int) -> FloatArray:
-    """(vertices, 3) float32: the mean of the normals of all corners at each vertex; +z where there is none."""
-    total = np.stack([np.bincount(faces.ravel(), normals[..., axis].ravel(), vertices) for axis in range(3)], axis=1)
-    size = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.where(size > 0, total / np.maximum(size, 1e-30), (0.0, 0.0, 1.0)).astype(np.float32)
+def pieces(count: int) -> Iterator[slice]:
+    """All rows of `count`, so many at a time that what is made of them on the way stays small."""
+    return (slice(first, first + _AT_ONCE) for first in range(0, count, _AT_ONCE))
 
 
-def _apart(normals: FloatArray, shared: FloatArray) -> FloatArray:
-    """(k, 3) bool: corners whose normal is too far from their vertex's."""
-    cosine = np.einsum("ijk,ijk->ij", normals, shared)
-    for degrees in _SHARING_DEG:
-        apart = cosine < math.cos(math.radians(degrees))
-        if int(apart.sum()) <= _MOST_APART:
-            break
-    return np.asarray(apart)
+def joined(parts: list[FloatArray]) -> FloatArray:
+    """The parts one after another; a single one as it is, for it may be large."""
+    return np.concatenate(parts) if parts[1:] else parts[0]
+
+
+def areas(corners: FloatArray) -> FloatArray:
+    """(k,) of triangles (k, 3, 3)."""
+    return np.asarray(0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1))
+
+
+def _vertex_normals(geometry: Geometry) -> FloatArray:
+    """(n, 3) float32: the mean of the normals of all corners at each vertex; +z where there is none."""
+    total = np.zeros((len(geometry.vertices), 3))
+    _add_corner_normals(geometry.faces, geometry.normals, geometry.rows, total)
+    mean = np.empty(total.shape, np.float32)
+    for some in pieces(len(total)):
+        size = np.linalg.norm(total[some], axis=1, keepdims=True)
+        mean[some] = np.where(size > 0, total[some] / np.maximum(size, 1e-30), (0.0, 0.0, 1.0))
+    return mean
 
 
 @stage_kernel
-def _fill_lattices(corners, normals, chosen, steps, starts, place, normal):
+def _add_corner_normals(faces, normals, rows, total):
+    for face in range(len(faces)):
+        for corner in range(3):
+            for axis in range(3):
+                total[faces[face, corner], axis] += normals[rows[face, corner], axis]
+
+
+def _apart(geometry: Geometry, shared: FloatArray, steps: IntArray) -> tuple[IntArray, IntArray]:
+    """Faces of one step, and corners of them, whose normal is too far from their vertex's."""
+    for degrees in _SHARING_DEG:
+        found = []
+        for some in pieces(len(steps)):
+            small = some.start + np.flatnonzero(steps[some] == 1)
+            cosine = np.einsum("ijk,ijk->ij", geometry.corner_normals(small), shared[geometry.faces[small]])
+            face, corner = np.nonzero(cosine < math.cos(math.radians(degrees)))
+            found.append((small[face], corner))
+        if sum(len(face) for face, _ in found) <= _MOST_APART:
+            break
+    return np.concatenate([face for face, _ in found]), np.concatenate([corner for _, corner in found])
+
+
+@stage_kernel
+def _fill_lattices(corners, normals, steps, starts, place, normal):
     """Nodes (i, j), i + j <= steps, of every large face, row by row of j."""
-    for n in range(len(chosen)):
-        face = chosen[n]
-        k, at = steps[face], starts[n]
+    for face in range(len(steps)):
+        k, at = steps[face], starts[face]
         pull = _INSIDE / k
         for j in range(k + 1):
             for i in range(k + 1 - j):

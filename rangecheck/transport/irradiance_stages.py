@@ -64,28 +64,30 @@ def look_out(place, normal, skin, count, seed, first, rays):
 
 
 @inline_kernel
-def seen_from_behind(corners, normals, face, dx, dy, dz):
+def seen_from_behind(vertices, faces, normals, rows, face, dx, dy, dz):
     """Whether a ray meets the side of a face that its corners' normals turn away from."""
-    ex, ey, ez = corners[face, 3] - corners[face, 0], corners[face, 4] - corners[face, 1], corners[face, 5] - corners[face, 2]
-    fx, fy, fz = corners[face, 6] - corners[face, 0], corners[face, 7] - corners[face, 1], corners[face, 8] - corners[face, 2]
+    a, b, c, row = faces[face, 0], faces[face, 1], faces[face, 2], rows[face, 0]
+    ex, ey, ez = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
+    fx, fy, fz = vertices[c, 0] - vertices[a, 0], vertices[c, 1] - vertices[a, 1], vertices[c, 2] - vertices[a, 2]
     gx, gy, gz = ey * fz - ez * fy, ez * fx - ex * fz, ex * fy - ey * fx
-    out = gx * normals[face, 0] + gy * normals[face, 1] + gz * normals[face, 2]
+    out = gx * normals[row, 0] + gy * normals[row, 1] + gz * normals[row, 2]
     return (gx * dx + gy * dy + gz * dz > 0.0) == (out > 0.0)
 
 
 @stage_kernel
-def see_sky(surroundings, normals, corners, rays, count, sides, faces, light):
+def see_sky(surroundings, geometry, rays, count, met, light):
     """Add what rays see of the surroundings to their records; mark back sides."""
     sky, frame, period, softness, low, high, picture, boxes, glow = surroundings
-    for k in range(len(faces)):
-        face = np.int64(faces[k])
+    vertices, faces, normals, rows, _, _ = geometry
+    for k in range(len(met)):
+        face = np.int64(met[k])
         dx, dy, dz = float(rays.direction[k, 0]), float(rays.direction[k, 1]), float(rays.direction[k, 2])
         if face < 0:
             add_surroundings(
                 sky, frame, period, softness, low, high, picture, boxes, glow, dx, dy, dz, rays.weight, k, light, k // count
             )  # fmt: skip
-        elif seen_from_behind(corners, normals, face, dx, dy, dz):
-            faces[k] = -2 - face
+        elif seen_from_behind(vertices, faces, normals, rows, face, dx, dy, dz):
+            met[k] = -2 - face
 
 
 @stage_kernel

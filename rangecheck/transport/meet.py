@@ -43,7 +43,7 @@ def meet(geometry, sources, surroundings, stored, rays, n, reflections, backdrop
     them); rays that gather over a lobe or a hemisphere never do, for sources light surfaces directly. stored: light of their hemispheres that
     is kept on the surfaces (see `irradiance`). Returns the number of hits."""
     # taken apart once, not ray by ray
-    corners, normals, materials, skin = geometry
+    vertices, corners, normals, rows, materials, skin = geometry
     centre, radius, radiance = sources
     sky, frame, period, softness, low, high, picture, boxes, glow = surroundings
     origin, direction, far, faces, us, vs, weight, pixels, kinds, firsts, streams, numbers = rays
@@ -73,7 +73,9 @@ def meet(geometry, sources, surroundings, stored, rays, n, reflections, backdrop
                     sky, frame, period, softness, low, high, picture, boxes, glow, dx, dy, dz, weight, i, sample, pixel
                 )
             continue
-        place_hit(corners, normals, skin, face, float(us[i]), float(vs[i]), dx, dy, dz, place, shading, facing, count)
+        place_hit(
+            vertices, corners, normals, rows, skin, face, float(us[i]), float(vs[i]), dx, dy, dz, place, shading, facing, count
+        )  # fmt: skip
         for axis in range(3):
             arriving[count, axis] = direction[i, axis]
         for c in range(channels):
@@ -84,7 +86,7 @@ def meet(geometry, sources, surroundings, stored, rays, n, reflections, backdrop
         if sides > 0 and reflections + 1 < tally.shape[1]:
             out = 0.0
             for axis in range(3):
-                out += facing[count, axis] * normals[face, axis]
+                out += facing[count, axis] * normals[rows[face, 0], axis]
             if sides == 2 or out > 0.0:
                 settled[count] = True
                 shift = np.int64(0) if out > 0.0 else np.int64(len(kept) // 2)

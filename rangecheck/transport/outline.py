@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from rangecheck.arrays import BoolArray, FloatArray
+from rangecheck.arrays import BoolArray, FloatArray, IntArray
 from rangecheck.kernels import stage_kernel
 from rangecheck.transport.geometry import SourceArrays
 
@@ -21,11 +21,11 @@ _CELLS = 64
 _NEAR = 1e-4
 
 
-def boxes_of(corners: FloatArray) -> FloatArray:
-    """(k, 6) float32 low and high corners of boxes that together hold the faces of corners (m, 9)."""
+def boxes_of(vertices: FloatArray, faces: IntArray) -> FloatArray:
+    """(k, 6) float32 low and high corners of boxes that together hold the faces (m, 3) over vertices (n, 3)."""
     boxes = np.empty((_CELLS**3, 6), np.float32)
     boxes[:, :3], boxes[:, 3:] = np.inf, -np.inf
-    _gather(corners, _CELLS, boxes)
+    _gather(vertices, faces, _CELLS, boxes)
     return np.ascontiguousarray(boxes[boxes[:, 0] <= boxes[:, 3]])
 
 
@@ -45,18 +45,18 @@ def pixels_of(boxes: FloatArray, camera: FloatArray, rotation: FloatArray, eye: 
 
 
 @stage_kernel
-def _gather(corners, cells, boxes):
+def _gather(vertices, faces, cells, boxes):
     """Widen the box of the cell in which each face has its first corner."""
-    for face in range(len(corners)):
+    for face in range(len(faces)):
         cell = np.int64(0)
         for axis in range(3):
-            step = np.int64((corners[face, axis] + 1.0) * 0.5 * cells)
+            step = np.int64((vertices[faces[face, 0], axis] + 1.0) * 0.5 * cells)
             cell = cell * cells + min(max(step, np.int64(0)), np.int64(cells - 1))
-        for k in range(9):
-            axis = k % 3
-            value = corners[face, k]
-            boxes[cell, axis] = min(boxes[cell, axis], value)
-            boxes[cell, axis + 3] = max(boxes[cell, axis + 3], value)
+        for corner in range(3):
+            for axis in range(3):
+                value = vertices[faces[face, corner], axis]
+                boxes[cell, axis] = min(boxes[cell, axis], value)
+                boxes[cell, axis + 3] = max(boxes[cell, axis + 3], value)
 
 
 @stage_kernel

@@ -31,7 +31,7 @@ def records_for(pixels: int) -> int:
 
 def rays_to_keep(tracer: Tracer, records: int) -> float:
     """About how many rays it takes to gather what is kept, other work counted as rays."""
-    nodes = len(tracer.caster.vertices) + 20 * records
+    nodes = len(tracer.geometry.vertices) + 20 * records
     return 1.5 * RAYS * records + nodes * (_NODE_RAYS + len(tracer.sources.radius))
 
 
@@ -62,7 +62,7 @@ def _met(tracer: Tracer, origin: FloatArray, direction: FloatArray) -> Places:
     tracer.caster.closest_local(origin, direction, far, face, u, v)
     hit = np.flatnonzero(face >= 0)
     face, u, v = face[hit], u[hit], v[hit]
-    corners = tracer.geometry.normals.reshape(-1, 3, 3)[face]
+    corners = tracer.geometry.corner_normals(face)
     normal = (np.stack([1 - u - v, u, v], axis=1)[:, :, None] * corners).sum(axis=1)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
     back = np.einsum("ij,ij->i", normal, direction[hit]) > 0
@@ -94,7 +94,7 @@ def off_at_second(tracer: Tracer, kept: IrradianceCache, seen: Places, looked_at
     chance = np.random.default_rng([seed, 0x2D])
     height, turn = chance.random((2, len(chosen) * _EACH))
     normal = np.repeat(seen.normal[chosen], _EACH, axis=0)
-    corners = tracer.geometry.corners.reshape(-1, 3, 3)[seen.face[chosen]]
+    corners = tracer.geometry.corners(seen.face[chosen])
     u, v = seen.u[chosen], seen.v[chosen]
     place = np.repeat((np.stack([1 - u - v, u, v], axis=1)[:, :, None] * corners).sum(axis=1), _EACH, axis=0)
     # by the cosine: a point of the unit sphere added to the normal

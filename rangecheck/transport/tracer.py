@@ -181,7 +181,7 @@ class Tracer:
             return None
         if not picture.outline:
             if not self._boxes:
-                self._boxes.append(boxes_of(self.geometry.corners))
+                self._boxes.append(boxes_of(self.geometry.vertices, self.geometry.faces))
             boxes = np.concatenate([self._boxes[0], boxes_around(self.sources)]) if len(self.sources.radius) else self._boxes[0]
             picture.outline.append(picture.may_see(boxes))
         return picture.outline[0]
