@@ -1,6 +1,9 @@
 """Studies of meshing and registration: what they measure is what they say, on cases whose answer is known."""
 
 import math
+import os
+import signal
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,7 +14,9 @@ from rangecheck.studies import study_named
 from rangecheck.studies.bust_scans import bust_ring, bust_views, near_samples, real_data
 from rangecheck.studies.meshing_busts import errors_of
 from rangecheck.studies.meshing_edges import _with_outliers
+from rangecheck.studies.meshing_methods import Apart
 from rangecheck.studies.registration import shaken, strays_mm
+from rangecheck.study import Candidate, measure
 from rangecheck.surface.distance import SurfaceDistance
 from rangecheck.surface.surface import Surface
 
@@ -73,3 +78,27 @@ def test_a_ring_sees_the_bust_from_as_many_sides_as_asked():
 def test_the_study_of_scans_times_reading():
     found = study_named("scans", "reading")(quick=True)
     assert found.tables["reading"][0]["what"] == "depth PNG of 512 x 512" and found.tables["reading"][0]["seconds"] > 0
+
+
+def _crashes(scans):
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
+def _face(scans):
+    return Surface(scans[0].points_mm()[:3], np.array([[0, 1, 2]], np.int32))
+
+
+def test_a_method_that_crashes_is_told_and_the_others_go_on(views):
+    with Apart(views) as apart:
+        runs = {"sound": partial(apart.run, _face), "crash": partial(apart.run, _crashes)}
+        found = {
+            m.method: m
+            for m in measure(
+                [Candidate(name, "", run) for name, run in runs.items()],
+                lambda surface: math.nan if surface is None else float(np.abs(surface.vertices - views[0].points_mm()[:3]).max()),
+                rounds=2,
+                warmups=0,
+            )
+        }
+    assert found["sound"].error == 0.0 and found["sound"].seconds > 0.0
+    assert math.isnan(found["crash"].error) and math.isnan(found["crash"].seconds)

@@ -20,7 +20,7 @@ from rangecheck.studies.bust_scans import bust_ring, near_samples, real_data, sa
 from rangecheck.studies.meshing_busts import busts
 from rangecheck.studies.meshing_edges import KNOBS, knob_part
 from rangecheck.studies.meshing_growth import growth, memory
-from rangecheck.studies.meshing_methods import Method, methods
+from rangecheck.studies.meshing_methods import FOREIGN, Apart, Method, methods
 from rangecheck.study import Candidate, Measurement, Part, SpeedChart, measure, study_of_parts
 from rangecheck.surface.meshing import grid_mesh
 from rangecheck.surface.meshing.oriented import spacing_of
@@ -42,19 +42,37 @@ def _compared(
     What is slow at the first call (packages, kernels) is called before on a few small scans."""
     figures: list[dict[str, float]] = []
 
-    def error_of(surface: Surface) -> float:
+    def error_of(surface: Surface | None) -> float:
+        if surface is None:
+            figures.append({})
+            return math.nan
         figures.append(
             figures_of(surface) | {"open_edges": float(len(boundary_edges(surface.faces))), "faces": float(len(surface.faces))}
         )
         return next(iter(figures[-1].values()))
 
     small, shallow = bust_ring(3, width=64)[: len(scans)], methods((5,))
-    for name in {name for name, _ in wanted}:
-        next((make for key, make in [*shallow.items(), *wanted.items()] if key[0] == name))(small)
-    candidates = [Candidate(name, setting, partial(make, scans)) for (name, setting), make in wanted.items()]
-    measured = measure(candidates, error_of, rounds=rounds, warmups=0)
+    candidates = []
+    with Apart(scans) as apart:
+        for name in sorted({name for name, _ in wanted}):
+            first = next(make for key, make in [*shallow.items(), *wanted.items()] if key[0] == name)
+            if name.startswith(FOREIGN):
+                apart.run(first, small)
+            else:
+                first(small)
+        for (name, setting), make in wanted.items():
+            run = partial(apart.run, make) if name.startswith(FOREIGN) else partial(make, scans)
+            candidates.append(Candidate(name, setting, run))
+        measured = measure(candidates, error_of, rounds=rounds, warmups=0)
     rows: list[dict[str, object]] = [
-        {"method": m.method, "setting": m.setting, "seconds": m.seconds, "watertight": f["open_edges"] == 0, **f}
+        {
+            "method": m.method,
+            "setting": m.setting,
+            "seconds": m.seconds,
+            "crashed": math.isnan(m.seconds),
+            "watertight": f.get("open_edges") == 0,
+            **f,
+        }
         for m, f in zip(measured, figures)
     ]
     return measured, rows
@@ -76,9 +94,9 @@ def sample(quick: bool) -> Part:
         wanted = {key: make for key, make in wanted.items() if key[0] != "Poisson, MeshLab"}
     measured, rows = _compared(scans, wanted, partial(_rms, scans, within), 1)
     alone, more = _compared(scans[:1], {("grid", "one view"): lambda s: grid_mesh(s[0])}, partial(_rms, scans[:1], within), 1)
-    poissons = [m for m in measured if m.method.startswith("Poisson")]
-    best, ours = min(poissons, key=lambda m: m.error), measured[0]
-    findings = [
+    ours, poissons = measured[0], [m for m in measured if m.method.startswith(FOREIGN) and not math.isnan(m.seconds)]
+    best = min(poissons, key=lambda m: m.error, default=None)
+    findings = ["sample bust: every Poisson crashed"] if best is None else [
         f"sample bust, {sum(int(s.valid.sum()) for s in scans):,} points: fuse has an RMS of {ours.error:.4f} mm in {ours.seconds:.2f} s; the best "
         f"Poisson ({best.method[9:]}, {best.setting}) {best.error:.4f} mm in {best.seconds:.2f} s: fuse takes {ours.seconds / best.seconds:.2f} of its time"
     ]  # fmt: skip
@@ -111,15 +129,22 @@ def bunny(quick: bool) -> Part:
         others = {key: make for key, make in methods((8, 9)).items() if key not in raced}
         more, more_rows = _compared(scans, others, figures_of, 1)
         measured, rows = [*measured, *more], [*rows, *more_rows]
+    beside = (
+        f"{measured[0].seconds / theirs.seconds:.2f} of the time of"
+        if not math.isnan(theirs.seconds)
+        else f"{measured[0].seconds:.2f} s, beside a crash of"
+    )
     findings = [
         f"bunny: fuse lies {rows[0]['median_mm']:.4f} mm (median) and {rows[0]['p95_mm']:.4f} mm (95 %) from the published vertices, "
-        f"in {measured[0].seconds / theirs.seconds:.2f} of the time of open3d's Poisson, depth 8"
+        f"in {beside} open3d's Poisson, depth 8"
     ]
     return Part([_chart("bunny", "Meshing the Stanford bunny: ten scans", "median distance of the published vertices, mm", measured)],
                 findings + [_said(r) for r in rows], {"bunny": rows})  # fmt: skip
 
 
 def _said(row: dict[str, object]) -> str:
+    if row["crashed"]:
+        return f"  {row['method']} {row['setting']}: crashed"
     figures = ", ".join(
         f"{k[:-3].replace('_', ' ')} {v:.4f} mm"
         for k, v in row.items()

@@ -1,14 +1,23 @@
-"""The methods that the study of meshing compares: ours, and the engines with all their threads, which ours never give them."""
+"""The methods that the study of meshing compares: ours, and the engines with all their threads, which ours never give them.
+
+Engines run in a process of their own, which is kept from run to run: the first run of a process is slower, and an engine that crashes
+must not take the study with it (open3d's Poisson on all threads does so now and then). They are timed there."""
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from functools import partial
+from multiprocessing import get_context
 
 import numpy as np
 
 from rangecheck.arrays import FloatArray, IntArray
 from rangecheck.scan import RangeScan
+from rangecheck.study import Timed
 from rangecheck.surface.meshing import fuse, pivot
 from rangecheck.surface.meshing.oriented import open3d, oriented_points
 from rangecheck.surface.meshing.poisson import BOX_SCALE
@@ -46,6 +55,50 @@ def _surface(vertices: FloatArray, faces: IntArray) -> Surface:
 
 
 Method = Callable[[Sequence[RangeScan]], Surface]
+#: what foreign methods' names begin with
+FOREIGN = "Poisson"
+_held: Sequence[RangeScan] = ()
+
+
+def _hold(scans: Sequence[RangeScan]) -> None:
+    global _held
+    _held = scans
+
+
+def _timed(make: Method, scans: Sequence[RangeScan] | None) -> Timed:
+    begin = time.perf_counter()
+    surface = make(_held if scans is None else scans)
+    return Timed((surface.vertices, surface.faces), time.perf_counter() - begin)
+
+
+class Apart:
+    """A process that holds `scans` and runs methods on them; `close` ends it. Where it crashed, the next run has a new one."""
+
+    def __init__(self, scans: Sequence[RangeScan]) -> None:
+        self.scans = scans
+        self._pool: ProcessPoolExecutor | None = None
+
+    def run(self, make: Method, scans: Sequence[RangeScan] | None = None) -> Timed:
+        """The surface of `scans`, else of those held, and the seconds that took; None and nan where the process ended over it."""
+        if self._pool is None:
+            self._pool = ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=_hold, initargs=(self.scans,))
+        try:
+            found = self._pool.submit(_timed, make, scans).result()
+        except BrokenProcessPool:
+            self.close()
+            return Timed(None, math.nan)
+        return Timed(Surface(*found.result), found.seconds)
+
+    def close(self) -> None:
+        if self._pool is not None:
+            self._pool.shutdown()
+            self._pool = None
+
+    def __enter__(self) -> Apart:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 def methods(depths: Sequence[int]) -> dict[tuple[str, str], Method]:

@@ -4,7 +4,7 @@ from rangecheck.study.charts import EdgeChart, Line, LineChart, SpeedChart
 from rangecheck.study.machine import describe_machine
 from rangecheck.study.parts import Part, peak_memory_mb, study_of_parts
 from rangecheck.study.result import Study, write_study
-from rangecheck.study.speed import Candidate, Measurement, measure, pareto_front
+from rangecheck.study.speed import Candidate, Measurement, Timed, measure, pareto_front
 from rangecheck.study.stability import Edge, find_edge
 
 __all__ = [
@@ -17,6 +17,7 @@ __all__ = [
     "Part",
     "SpeedChart",
     "Study",
+    "Timed",
     "describe_machine",
     "find_edge",
     "measure",

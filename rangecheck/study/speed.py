@@ -28,6 +28,14 @@ class Candidate:
 
 
 @dataclass(frozen=True)
+class Timed:
+    """What a run returns that was timed where it was done, in another process: its result, None and nan seconds where that crashed."""
+
+    result: Any
+    seconds: float
+
+
+@dataclass(frozen=True)
 class Measurement:
     """`error` in the study's own measure (nan: it gave no answer); seconds for the whole work: median and quartiles over `rounds`."""
 
@@ -62,6 +70,8 @@ def measure(
     for index, candidate in enumerate(candidates if warmups else []):
         for _ in range(warmups):
             result = candidate.run()
+        if isinstance(result, Timed):
+            result = result.result
         errors[index] = float(error_of(result))
         del result
     seconds: list[list[float]] = [[] for _ in candidates]
@@ -75,6 +85,8 @@ def measure(
                 start = clock()
                 result = candidates[index].run()
                 seconds[index].append(clock() - start)
+                if isinstance(result, Timed):
+                    result, seconds[index][-1] = result.result, result.seconds
                 if turn == 0 and not warmups:
                     errors[index] = float(error_of(result))
                 del result
@@ -82,13 +94,18 @@ def measure(
         if collecting:
             gc.enable()
     return [
-        Measurement(c.method, c.setting, error, statistics.median(times), _quartiles(times), rounds)
+        Measurement(c.method, c.setting, error, _median(times), _quartiles(times), rounds)
         for c, error, times in zip(candidates, errors, seconds)
     ]
 
 
+def _median(times: list[float]) -> float:
+    """nan where one run gave no time: what crashed once is not to be compared."""
+    return math.nan if any(map(math.isnan, times)) else statistics.median(times)
+
+
 def _quartiles(times: list[float]) -> tuple[float, float]:
-    if len(times) < 2:
+    if len(times) < 2 or any(map(math.isnan, times)):
         return times[0], times[0]
     low, _, high = statistics.quantiles(times, n=4, method="inclusive")
     return low, high
