@@ -5,6 +5,8 @@ The library never prints and never exits; the command line maps this tree to exi
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -80,3 +82,14 @@ class DependencyMissing(RangecheckError):
     def __init__(self, package: str, purpose: str, remedy: str) -> None:
         super().__init__(f"{package} is needed for {purpose} and could not be loaded; mend it with: {remedy}")
         self.package, self.purpose, self.remedy = package, purpose, remedy
+
+
+@contextmanager
+def told_of(path: str | Path) -> Iterator[None]:
+    """Within this block, errors are about the content of the file or folder `path`: those that do not name it do so from here on."""
+    try:
+        yield
+    except RangecheckError as error:
+        if Path(path).name not in str(error):
+            error.args = (f"{path}: {error}",)
+        raise

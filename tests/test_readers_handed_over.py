@@ -111,3 +111,24 @@ def test_too_few_distances_are_told_with_the_name_of_the_file(tmp_path, capsys):
         said = capsys.readouterr().err.strip()
         assert str(path) in said and "1 of 48 cells hold a distance" in said and "\n" not in said
     assert not (tmp_path / "out.ply").exists()
+
+
+def test_a_cloud_in_obj_is_checked_as_a_cloud_and_a_mesh_in_obj_as_a_mesh(tmp_path, capsys):
+    points = "".join(f"v {x} {y} {x * y / 9}\n" for x in range(6) for y in range(6))
+    (tmp_path / "cloud.obj").write_text(points)
+    assert exit_status(["check", str(tmp_path / "cloud.obj"), "--unit", "mm", "-q"]) in (0, 1)
+    assert "1 readable point cloud" in capsys.readouterr().out
+    (tmp_path / "mesh.obj").write_text(points + "f 1 2 7\n")
+    assert exit_status(["check", str(tmp_path / "mesh.obj"), "--unit", "mm", "-q"]) == 1
+    assert "open-edges" in capsys.readouterr().out
+
+
+@pytest.mark.engines
+def test_too_few_points_are_refused_under_the_name_of_what_holds_them(tmp_path, capsys):
+    (tmp_path / "mostly-nan.obj").write_text("v 1 2 3\nv 2 3 4\n" + 300 * "v nan nan nan\n")
+    line = ["mesh", str(tmp_path / "mostly-nan.obj"), "--unit", "mm", "-o", str(tmp_path / "a.ply"), "-q"]
+    assert exit_status(line) == 2
+    assert "mostly-nan: 2 samples; at least 16 are needed: scan it again" in capsys.readouterr().err
+    (tmp_path / "all-nan.obj").write_text(300 * "v nan nan nan\n")
+    with pytest.raises(InputError, match=r"all-nan\.obj: holds no point: none is finite; check how it was exported"):
+        read_measured(tmp_path / "all-nan.obj", "mm")

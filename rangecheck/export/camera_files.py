@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from rangecheck.arrays import FloatArray
-from rangecheck.errors import ArrayError, CameraError
+from rangecheck.errors import ArrayError, CameraError, told_of
 from rangecheck.files import read_json, write_bytes, write_json
 from rangecheck.optics import Camera, PinholeCamera, camera_from_dict
 from rangecheck.rigid import checked, inverse, quaternion_from_rotation
@@ -58,7 +58,8 @@ def read_camera_json(path: str | Path) -> tuple[Camera, FloatArray, dict[str, An
     document = read_json(path)
     if not isinstance(document, dict) or document.get("schema") != SCHEMA or "camera" not in document:
         raise CameraError(f"{path} is no camera file: it must say schema {SCHEMA} and hold a camera")
-    camera = camera_from_dict(document.pop("camera"))
+    with told_of(path):
+        camera = camera_from_dict(document.pop("camera"))
     try:
         pose = checked(document.pop("world_from_camera", None), "world_from_camera")
     except ArrayError as error:

@@ -28,7 +28,7 @@ import numpy as np
 
 from rangecheck import rigid
 from rangecheck.arrays import FloatArray
-from rangecheck.errors import SceneError
+from rangecheck.errors import SceneError, told_of
 from rangecheck.files import read_toml
 from rangecheck.modeler import primitives
 from rangecheck.modeler.body import Body
@@ -63,7 +63,8 @@ TOUCHING = 1e-6
 def read_model(path: str | Path) -> Model:
     """The scene in a TOML file. Raises InputError (not TOML, unreadable mesh), SceneError (names the body and the rule)."""
     path = Path(path)
-    return model_from_dict(read_toml(path), path.parent)
+    with told_of(path):
+        return model_from_dict(read_toml(path), path.parent)
 
 
 def model_from_dict(document: Mapping[str, Any], folder: str | Path | None = None) -> Model:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING
 from rangecheck.arrays import FloatArray
 from rangecheck.config import Settings
 from rangecheck.errors import InputError, ScanError
-from rangecheck.files import sha256
+from rangecheck.files import read_bytes, sha256
 from rangecheck.modeler.model import Model
 from rangecheck.optics import PinholeCamera
 from rangecheck.pipeline.preparing import Measured, prepared
@@ -44,9 +45,13 @@ def holds_capture(path: Path) -> bool:
 
 
 def holds_scans(path: Path) -> bool:
-    """Whether `path` is read as range scans rather than as a mesh: by its kind, and for PLY by what its header announces."""
+    """Whether `path` is read as range scans rather than as a mesh: by its kind, for PLY by what its header announces, and OBJ where it
+    has points and no face."""
     if path.is_dir() or path.suffix.lower() not in MESH_SUFFIXES:
         return True
+    if path.suffix.lower() == ".obj":
+        content = read_bytes(path)
+        return bool(re.search(rb"^\s*v\s", content, re.MULTILINE)) and not re.search(rb"^\s*f\s", content, re.MULTILINE)
     if path.suffix.lower() != ".ply":
         return False
     from rangecheck.scan.readers.ply import announced

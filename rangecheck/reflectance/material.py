@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from rangecheck.arrays import FloatArray
-from rangecheck.errors import InputError, SceneError
+from rangecheck.errors import InputError, SceneError, told_of
 from rangecheck.files import presets_folder, read_toml
 from rangecheck.reflectance.energy import visibility_table
 from rangecheck.reflectance.fast import lobe_table
@@ -224,7 +224,8 @@ def load_material(name_or_path: str | Path) -> Material:
                 name_or_path, f"is no shipped material; choose one of {', '.join(shipped)}, or a .toml file", shipped=shipped
             )
         path = presets_folder() / "materials" / f"{name_or_path}.toml"
-    return _material_from(path, read_toml(path))
+    with told_of(path):
+        return _material_from(path, read_toml(path))
 
 
 _NUMBERS = ("K_lm", "K_ss", "K_sl", "K_s")

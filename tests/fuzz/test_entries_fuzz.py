@@ -56,6 +56,9 @@ def feed(group: str, folder: Path, count: int, seed: int) -> None:
         except RangecheckError as error:
             answer = "refused"
             fault = "more than one line" if "\n" in str(error) else ""
+            # what is given on the command line has no file
+            if entry.name != "set.txt" and path.name not in str(error) and place.name not in str(error):
+                fault = f"the message does not name the file: {error}"
         except BaseException as error:
             answer = "wrong"
             fault = f"{type(error).__name__} at {traceback.extract_tb(error.__traceback__)[-1]}: {str(error)[:200]}"

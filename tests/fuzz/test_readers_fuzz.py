@@ -77,6 +77,7 @@ def run(folder: Path, name: str, content: bytes, expect: bool = False) -> bool:
             )
     except RangecheckError as error:
         assert "\n" not in str(error), f"{name}: more than one line: {error}"
+        assert path.stem in str(error), f"{name}: the message does not name it: {error}"
         assert not expect, f"{name} is good and was refused: {error}"
         return False
     assert scans

@@ -25,7 +25,7 @@ import numpy as np
 
 from rangecheck import rigid
 from rangecheck.arrays import mm_per
-from rangecheck.errors import ArrayError, CameraError, InputError
+from rangecheck.errors import ArrayError, CameraError, InputError, told_of
 from rangecheck.files import read_bytes, read_json
 from rangecheck.kernels import in_chunks
 from rangecheck.optics import PinholeCamera, camera_from_dict
@@ -52,7 +52,8 @@ def read_capture(folder: str | Path) -> Capture:
     Raises InputError that names what is missing or does not fit."""
     folder = Path(folder)
     if (folder / "capture.json").is_file():
-        return _described(folder / "capture.json")
+        with told_of(folder / "capture.json"):
+            return _described(folder / "capture.json")
     if (folder / "leftCam").is_dir() and (folder / "rightCam").is_dir():
         named = [_by_number(folder / name) for name in ("leftCam", "rightCam")]
         # the last pictures of one camera, or of both, may be missing

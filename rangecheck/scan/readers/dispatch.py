@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from rangecheck.arrays import mm_per
-from rangecheck.errors import InputError, UnitMissing
+from rangecheck.errors import InputError, UnitMissing, told_of
 from rangecheck.files import read_bytes
 from rangecheck.scan.point_cloud import PointCloud
 from rangecheck.scan.range_scan import RangeScan
@@ -107,7 +107,7 @@ def read_measured(path: str | Path, unit: str | None = None) -> list[Measured]:
     if path.is_dir():
         return _read_folder(path, unit)
     # files hold any bits: NaN that signal, numbers past float32; what is not finite counts as not measured
-    with np.errstate(all="ignore"):
+    with told_of(path), np.errstate(all="ignore"):
         return list(_format_of(path).read(path, unit))
 
 

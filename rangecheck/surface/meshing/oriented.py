@@ -41,7 +41,10 @@ def oriented_points(scans: Sequence[RangeScan | PointCloud]) -> tuple[FloatArray
     engine = open3d()
     points = np.concatenate([s.points_mm if isinstance(s, PointCloud) else s.points_mm() for s in scans])
     if len(points) < 16:
-        raise ScanError(f"the scans hold {len(points)} samples; at least 16 are needed", valid=len(points))
+        raise ScanError(
+            f"{_named(scans)} {len(points)} samples; at least 16 are needed: scan it again, or mesh more scans together",
+            valid=len(points),
+        )
     shift = points.mean(axis=0)
     cloud = engine.geometry.PointCloud(engine.utility.Vector3dVector(points - shift))
     cloud.estimate_covariances(engine.geometry.KDTreeSearchParamKNN(min(NEIGHBOURS, len(points) - 1)))
@@ -63,8 +66,17 @@ def oriented_points(scans: Sequence[RangeScan | PointCloud]) -> tuple[FloatArray
             normals[flat] = _consistent(engine, points[flat], normals[flat])
         start += count
     if spread.sum() < 16:
-        raise ScanError(f"{int(spread.sum())} samples have neighbours that span a plane; at least 16 are needed")
+        raise ScanError(
+            f"{_named(scans)} {int(spread.sum())} samples whose neighbours span a plane; at least 16 are needed: look for lines or copies of points"
+        )
     return points[spread], normals[spread]
+
+
+def _named(scans: Sequence[RangeScan | PointCloud]) -> str:
+    """What holds the samples, for a message that goes on with how many."""
+    names = [scan.name or "unnamed" for scan in scans]
+    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    return f"{', '.join(names[:3])}{more}:"
 
 
 def _consistent(engine: ModuleType, points: FloatArray, normals: FloatArray) -> FloatArray:
