@@ -1,5 +1,7 @@
 """What an animation shows of a surface, measured: planted noise comes back as planted, a planted dent where it was planted."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -8,10 +10,12 @@ from test_maps import ball
 from rangecheck import kernels, rigid
 from rangecheck.animation import faces_seen, measure_consistency, orbit_around, outline_of, verdict_for
 from rangecheck.animation.measured_normals import lit_picture, normals_in_shading, normals_in_waves
+from rangecheck.animation.orbit import Orbit
 from rangecheck.animation.standing_out import FALSE_PLACES, look_at_places, look_of, normals_around, spots
 from rangecheck.errors import SurfaceError
 from rangecheck.maps import trace_maps
 from rangecheck.optics import PinholeCamera, Sensor
+from rangecheck.pipeline.consistency import standing_in_frames
 from rangecheck.reflectance import load_material
 from rangecheck.scan import RangeScan
 from rangecheck.scene import Scene, studio
@@ -198,6 +202,28 @@ def test_a_dent_in_a_fold_is_found_along_it_and_a_fold_is_no_dent():
 def test_a_dent_is_found_in_plaster_whose_lights_stand_still_while_it_turns():
     (found,) = spots(look_at_places(in_shading(sheet(lambda x, y: cap(x, y) + hollow(x, y, 0.2))), (1.0,)))
     assert np.hypot(*found.centre_mm[:2]) < 1.0
+
+
+def test_a_dent_is_found_in_the_frames_of_a_plaster_turntable_alone():
+    scene = studio(sheet(lambda x, y: cap(x, y) + hollow(x, y, 0.2)), load_material("plaster"), "dark", smooth=True).grey()
+    orbit = Orbit((0.0, 0.0, 0.0), 400.0, elevation_deg=6.0, frames=13, swing_deg=60.0)
+    exposure = 0.5
+    sensor = replace(SENSOR, electrons_per_unit=exposure * SENSOR.full_well)
+
+    def frame(index):
+        turned = scene.lights_moved(orbit.world_from_turned(index))
+        light = Tracer(turned).render(CAMERA, orbit.world_from_camera(index), MATT, seed=index).radiance[..., 0]
+        return sensor.expose(light.astype(float), frame=index)
+
+    told = standing_in_frames(scene, CAMERA, orbit, frame, exposure, sensor)
+    (found,) = told.spots
+    assert np.hypot(*found.centre_mm[:2]) < 1.0 and 0.1 < found.depth_mm < 0.2
+    assert told.shown == "frames" and told.pictures == told.views == 13 and told.noise_deg < 2.0
+    assert told.lines()[0].startswith("13 frames tell slopes to") and "a dent at" in told.lines()[1]
+
+    # pixels wider than what is looked for tell of no place, and no frame is looked at
+    coarse = standing_in_frames(scene, PinholeCamera.from_field_of_view(20, 20, 11.5), orbit, None, exposure, sensor)
+    assert coarse.spots == () and "not told; pixels of" in coarse.lines()[0]
 
 
 def test_places_are_the_same_bytes_on_any_number_of_threads():
