@@ -13,7 +13,7 @@ demo: $(VENV)/.ready-demo
 	$(BIN)/rangecheck run sample_data --out $(OUT) --force
 
 test: $(VENV)/.ready-test
-	$(BIN)/pytest -n 2 --dist loadfile $(PYTEST_ARGS)
+	$(BIN)/pytest -n 2 --dist loadgroup --no-loadscope-reorder $(PYTEST_ARGS)
 
 lint: $(VENV)/.ready-test
 	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy && $(BIN)/lint-imports

@@ -1,6 +1,11 @@
-"""Shared fixtures; where the real scans are."""
+"""Shared fixtures; where the real scans are; which tests share a process."""
 
+import contextlib
+import io
 import os
+import re
+import shlex
+from dataclasses import dataclass
 from pathlib import Path
 
 import hypothesis
@@ -32,6 +37,71 @@ def real_data() -> Path:
 def sample_data() -> Path:
     """The scans that the project made itself."""
     return ROOT / "sample_data"
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command of README and what stands below it there."""
+
+    arguments: tuple[str, ...]
+    said: str
+
+
+def readme_commands() -> list[Command]:
+    """Every command in README, in order."""
+    blocks = re.findall(r"^```console\n(.*?)^```(?:\n\n```text\n(.*?)^```)?", (ROOT / "README.md").read_text(), re.S | re.M)
+    found = []
+    for block, said in blocks:
+        lines = [line[2:] for line in block.splitlines() if line.startswith("$ ")]
+        for line in lines:
+            program, *arguments = shlex.split(line)
+            assert program == "rangecheck"
+            found.append(Command(tuple(arguments), said if line == block.splitlines()[-1][2:] else ""))
+    return found
+
+
+@dataclass(frozen=True)
+class Job:
+    """README's first command, done: the whole job on the eight sample views. `folder` is where it was done, `out` what it made."""
+
+    folder: Path
+    out: Path
+    status: int
+    told: str
+
+
+@pytest.fixture(scope="session")
+def readme_job(tmp_path_factory) -> Job:
+    """README's first command, which is the whole job: minutes of work that the tests of README and of the job share."""
+    from rangecheck_cli.main import exit_status
+
+    folder = tmp_path_factory.mktemp("job") / "bust, eight views"
+    folder.mkdir()
+    for name in ("sample_data", "configs"):
+        (folder / name).symlink_to(ROOT / name)
+    first = readme_commands()[0].arguments
+    assert first[:2] == ("run", "sample_data")
+    told = io.StringIO()
+    with contextlib.chdir(folder), contextlib.redirect_stdout(told), contextlib.redirect_stderr(told):
+        status = exit_status([*first])
+    return Job(folder, folder / first[first.index("--out") + 1], status, told.getvalue())
+
+
+#: files whose tests take longest, or share what takes long, first: where they began last, one process would end alone
+LONGEST = (
+    ("test_readme", "test_run"), ("test_animation_consistency",), ("test_registration",), ("test_hardness",), ("test_transport_plan",),
+    ("test_report", "test_report_browser"), ("test_packaging",), ("test_decode",),
+)  # fmt: skip
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests of one file, and of files that share a job, go to one process; the longest begin first."""
+    ranks = {name: (rank, " and ".join(names)) for rank, names in enumerate(LONGEST) for name in names}
+    for item in items:
+        name = item.path.stem
+        item.add_marker(pytest.mark.xdist_group(ranks[name][1] if name in ranks else str(item.path)))
+    items.sort(key=lambda item: ranks.get(item.path.stem, (len(LONGEST), ""))[0])
 
 
 @pytest.fixture(scope="session", autouse=True)

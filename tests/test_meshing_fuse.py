@@ -299,17 +299,3 @@ def test_what_cannot_be_fused_is_refused_with_the_reason():
         fuse([RangeScan(lonely, CAMERA)])
     with pytest.raises(SettingError, match="blocks"):
         fuse(scans, voxel_mm=1e-5)
-
-
-@pytest.mark.real_data
-def test_the_bunny_fused_from_its_ten_scans_agrees_with_its_zippered_mesh(real_data):
-    from rangecheck.scan.readers import read_scans
-    from rangecheck.surface.distance import SurfaceDistance
-    from rangecheck.surface.mesh_files import read_mesh
-
-    surface = fuse(read_scans(real_data / "stanford_bunny" / "bun.conf", unit="m"))
-    assert_closed_manifold(surface)
-    zipper = read_mesh(real_data / "stanford_bunny" / "bun_zipper.ply", "m")
-    distance = SurfaceDistance(surface).distance_mm(zipper.vertices[np.unique(zipper.faces)])[0]
-    assert np.median(distance) < 0.03
-    assert np.quantile(distance, 0.95) < 0.12

@@ -1,9 +1,9 @@
 """Every command in README works as it stands there, in order, and every picture and path that it names exists."""
 
 import re
-import shlex
 from pathlib import Path
 
+from conftest import readme_commands
 from rangecheck_cli.main import exit_status
 
 from rangecheck.studies import STUDIES
@@ -12,26 +12,20 @@ ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text()
 
 
-def test_every_command_in_readme_works_and_says_what_stands_below_it(tmp_path, monkeypatch, capsys):
-    for folder in ("sample_data", "configs"):
-        (tmp_path / folder).symlink_to(ROOT / folder)
-    monkeypatch.chdir(tmp_path)
-    blocks = re.findall(r"^```console\n(.*?)^```(?:\n\n```text\n(.*?)^```)?", README, re.S | re.M)
-    commands = [
-        (line[2:], said if line == block.splitlines()[-1] else "")
-        for block, said in blocks
-        for line in block.splitlines()
-        if line.startswith("$ ")
-    ]
-    assert len(commands) > 12 and any(said for _, said in commands)
-    for command, said in commands:
-        program, *arguments = shlex.split(command)
-        assert program == "rangecheck"
-        capsys.readouterr()
+def test_every_command_in_readme_works_and_says_what_stands_below_it(readme_job, monkeypatch, capsys):
+    monkeypatch.chdir(readme_job.folder)
+    commands = readme_commands()
+    assert len(commands) > 12 and any(command.said for command in commands)
+    for number, command in enumerate(commands):
+        arguments, said = [*command.arguments], command.said
+        if number == 0:
+            status, told = readme_job.status, readme_job.told
+        else:
+            capsys.readouterr()
+            status = exit_status(arguments if said else [*arguments, "-q"])
+            told = "".join(capsys.readouterr())
         # a small job's verdict may be that it is not fit; what must not happen is that a command fails
-        status = exit_status(arguments if said else [*arguments, "-q"])
-        assert status in ((0, 1) if arguments[0] in ("run", "check") else (0,)), command
-        told = "".join(capsys.readouterr())
+        assert status in ((0, 1) if arguments[0] in ("run", "check") else (0,)), arguments
         for line in said.splitlines():
             assert re.search(f"^{re.escape(line).replace(re.escape('...'), '.*')}$", told, re.M), line
 

@@ -9,20 +9,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rangecheck_cli.main import exit_status
+from test_meshing_fuse import assert_closed_manifold
 
 from rangecheck.scan.readers import read_scans
+from rangecheck.studies.hardness_jobs import small_scans
 from rangecheck.surface.distance import SurfaceDistance
 from rangecheck.surface.mesh_files import read_mesh
 
 SMALL = ["--size", "96x96", "--frames", "4", "-q"]
 
 
-@pytest.fixture(scope="session")
-def bust_job(sample_data, tmp_path_factory) -> Path:
+@pytest.fixture
+def bust_job(readme_job) -> Path:
     """The finished job on the eight sample views."""
-    out = tmp_path_factory.mktemp("job") / "bust, eight views"
-    assert exit_status(["run", str(sample_data), "--out", str(out), *SMALL]) == 0
-    return out
+    assert readme_job.status == 0
+    return readme_job.out
 
 
 @pytest.fixture(scope="session")
@@ -87,24 +88,43 @@ def test_a_finished_job_is_not_replaced_without_force(bust_job, sample_data, cap
     assert (bust_job / "bust.stl").read_bytes() == before
 
 
-def test_a_verdict_that_says_no_holds_the_stl_back(sample_data, tmp_path):
+def test_a_verdict_that_says_no_holds_the_stl_back(tmp_path):
     strict = ["--set", "checking.max_invented_percent=0.0", "--set", 'light.materials=["plaster"]']
-    assert exit_status(["run", str(sample_data / "frontal"), "--out", str(tmp_path / "out"), *SMALL, *strict]) in (0, 1)
+    assert exit_status(["run", str(small_scans(tmp_path)), "--out", str(tmp_path / "out"), *SMALL, *strict]) in (0, 1)
     document = json.loads((tmp_path / "out" / "run.json").read_text())
     assert document["fit"] == (tmp_path / "out" / "bust.stl").exists()
 
 
+@pytest.fixture(scope="module")
+def bunny_job(real_data, tmp_path_factory) -> Path:
+    """The finished job on the ten scans of the Stanford bunny."""
+    out = tmp_path_factory.mktemp("bunny") / "bunny"
+    assert exit_status(["run", str(real_data / "stanford_bunny" / "bun.conf"), "--unit", "m", "--out", str(out), *SMALL]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def published_mm(real_data) -> np.ndarray:
+    """(n, 3) the vertices of the published mesh."""
+    published = read_mesh(real_data / "stanford_bunny" / "bun_zipper.ply", "m")
+    return published.vertices[np.unique(published.faces)]
+
+
 @pytest.mark.real_data
-def test_the_real_bunny_becomes_a_solid_close_to_the_published_one(real_data, tmp_path):
-    out = tmp_path / "bunny"
-    bunny = real_data / "stanford_bunny"
-    assert exit_status(["run", str(bunny / "bun.conf"), "--unit", "m", "--out", str(out), *SMALL]) == 0
-    published = read_mesh(bunny / "bun_zipper.ply", "m")
-    used = np.unique(published.faces)
-    vertices = published.vertices[used]
-    made = read_mesh(out / "bust.stl", "mm")
-    above = vertices[:, 1] > made.bounds_mm[0, 1]
-    distance, _ = SurfaceDistance(made).distance_mm(vertices[above])
+def test_the_bunny_fused_from_its_ten_scans_agrees_with_its_zippered_mesh(bunny_job, published_mm):
+    assert json.loads((bunny_job / "run.json").read_text())["method"] == "fuse"
+    surface = read_mesh(bunny_job / "surface.ply", "mm")
+    assert_closed_manifold(surface)
+    distance = SurfaceDistance(surface).distance_mm(published_mm)[0]
+    assert np.median(distance) < 0.03
+    assert np.quantile(distance, 0.95) < 0.12
+
+
+@pytest.mark.real_data
+def test_the_real_bunny_becomes_a_solid_close_to_the_published_one(bunny_job, published_mm):
+    made = read_mesh(bunny_job / "bust.stl", "mm")
+    above = published_mm[:, 1] > made.bounds_mm[0, 1]
+    distance, _ = SurfaceDistance(made).distance_mm(published_mm[above])
     assert above.mean() > 0.95
     assert np.median(distance) <= 0.06
     assert np.quantile(distance, 0.95) <= 0.3

@@ -26,7 +26,7 @@ TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
 turned_cube = Surface(cube(20.0).vertices @ TURN.T, cube(20.0).faces)
 
 
-@pytest.mark.parametrize("step", [0.5, 0.9])
+@pytest.mark.parametrize("step", [0.7, 1.0])
 def test_the_offset_of_a_ball_is_a_ball_and_that_of_a_cube_a_cube(step):
     inner = inner_offset(ball(96, 12.0), 3.0, step)
     assert check_solid(inner).fit
