@@ -14,9 +14,12 @@ from test_solid_repair import BALL, ball
 from test_topology import grid, torus
 from test_topology_distance import CUBE_CORNERS, CUBE_FACES, cube
 
+from rangecheck.config import load_settings
 from rangecheck.errors import SettingError, SurfaceError
 from rangecheck.export.meshes import write_mesh
 from rangecheck.export.stl import stl_bytes, write_stl
+from rangecheck.pipeline.shape import make_solid
+from rangecheck.progress import Reporter
 from rangecheck.solid import Solid, close_relief, repair
 from rangecheck.solid.base import trimmed
 from rangecheck.solid.closing import choose_way, close_surface
@@ -57,6 +60,14 @@ def test_a_sheet_is_closed_as_a_relief_a_body_by_repair_and_both_say_why():
 def test_the_leash_shrinks_with_the_part():
     tiny = Surface(BALL.vertices * 1e-3, BALL.faces[:-1])
     assert any("the leash is" in words for words in close_surface(tiny, max_move_mm=0.05).refused)
+
+
+def test_with_little_memory_a_solid_is_proved_without_manifold3d_and_what_only_that_does_is_refused(monkeypatch):
+    monkeypatch.setattr("rangecheck.memory._most_mb", 1.0)
+    made = make_solid(BALL, load_settings(None, (), {"solid.base": "none"}), Reporter())
+    assert made.solid is not None and "manifold3d" in made.verdict.get("left-out").message
+    with pytest.raises(SettingError, match=r"solid.wall_mm, solid.base of .* faces takes about .* MB, and memory_mb leaves 0"):
+        make_solid(BALL, load_settings(None, (), {"solid.wall_mm": 2.0}), Reporter())
 
 
 def test_bodies_that_run_into_each_other_are_united_to_their_closed_form():

@@ -39,6 +39,8 @@ from rangecheck_cli import main
 from rangecheck.pipeline import turning_job
 
 drawn = turning_job.picture_of
+# a shell that started the tests in the background had interrupts ignored, and that is inherited
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 def interrupted(job, image, exposure, index):
     if index == 20:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rangecheck import memory
 from rangecheck.arrays import FloatArray
 from rangecheck.config import Settings
 from rangecheck.config.schema import Solidify
@@ -20,7 +21,8 @@ from rangecheck.progress import Reporter
 from rangecheck.rigid import inverse
 from rangecheck.solid import Solid, Verdict, check_solid, choose_base_height, untangle, verdict
 from rangecheck.solid.base import UP, trimmed
-from rangecheck.solid.closing import Closed, close_surface
+from rangecheck.solid.closing import Closed, choose_way, close_surface
+from rangecheck.solid.engine import needed_mb
 from rangecheck.solid.hollow import Hollow, hollow
 from rangecheck.surface import ORIGIN_NAMES, Surface
 from rangecheck.surface.standing import file_from_scans
@@ -51,8 +53,9 @@ def solid_of(
 
 
 def make_solid(surface: Surface, settings: Settings, reporter: Reporter, eye_mm: FloatArray | None = None) -> Made:
-    """As `solid_of`, with all that was done."""
+    """As `solid_of`, with all that was done. Raises SettingError where memory is bounded and has no room for a step that was asked for."""
     wanted = settings.solid
+    _refuse_what_has_no_room(surface, wanted, eye_mm)
     with reporter.stage("closing"):
         closed = _closed(surface, wanted, eye_mm, reporter)
     made = Made(None, closed.after, closed.surface, closed)
@@ -77,6 +80,27 @@ def make_solid(surface: Surface, settings: Settings, reporter: Reporter, eye_mm:
         found = refusal.measured.get("verdict")
         made.solid, made.verdict = None, found if isinstance(found, Verdict) else check_solid(made.surface)
     return made
+
+
+def _refuse_what_has_no_room(surface: Surface, wanted: Solidify, eye_mm: FloatArray | None) -> None:
+    """Steps that manifold3d does, where it takes more than there is: said before anything is computed."""
+    takes, left = needed_mb(len(surface.faces)), memory.left_mb()
+    if takes <= left:
+        return
+    steps = {
+        "solid.cut": wanted.cut is not None,
+        "solid.base_height_mm": wanted.base_height_mm is not None,
+        "solid.simplify_mm": wanted.simplify_mm is not None,
+        "solid.wall_mm": wanted.wall_mm is not None,
+        "solid.base": wanted.base != "none" and choose_way(surface, one_scan=eye_mm is not None)[0] != "relief",
+    }
+    named = [key for key, is_asked in steps.items() if is_asked]
+    if named:
+        raise SettingError(
+            f"{', '.join(named)} of {len(surface.faces):,} faces takes about {takes:,.0f} MB, and memory_mb leaves {left:,.0f}; "
+            "raise it, or leave that out (--base none)",
+            key=named[0],
+        )
 
 
 def _proved(surface: Surface, settings: Settings, reporter: Reporter) -> Solid:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from rangecheck import memory
 from rangecheck.arrays import mm_per
+from rangecheck.solid.engine import needed_mb
 from rangecheck.solid.findings import Finding, Verdict, finding, verdict
 from rangecheck.solid.opinions import Judges, Opinion, disagreements
 from rangecheck.solid.printer import Printer
@@ -21,8 +22,6 @@ from rangecheck.solid.solid import Solid, check_solid, engine_refuses
 from rangecheck.surface.edges import forget_edges
 from rangecheck.surface.mesh_files import MeshFile, open_mesh
 
-#: what manifold3d takes of a face (measured from 2e5 to 6e6 faces: 360 to 405), and the tables that stand beside it
-ENGINE_BYTES = 405 + 75
 #: faces up to which MeshLab is asked for its own count of faces that cross
 MESHLAB_CROSSINGS = 500_000
 
@@ -50,8 +49,8 @@ def check_mesh_file(
     read = open_mesh(path, unit)
     found: list[Finding] = []
     answers: list[Opinion] = []
-    needed_mb = ENGINE_BYTES * len(read.surface.faces) / 1e6
-    fits = needed_mb <= memory.left_mb()
+    takes_mb = needed_mb(len(read.surface.faces))
+    fits = takes_mb <= memory.left_mb()
     with ExitStack() as stack:
         # the others think in processes of their own while the surface is judged here, or afterwards where memory is bounded
         judges = stack.enter_context(_asked(path, read)) if opinions and not memory.bounded() else None
@@ -72,7 +71,7 @@ def check_mesh_file(
         facts["engine_asked"] = answers[-1].closed is not None
     left_out = [] if fits else ["manifold3d"] * (not opinions) + ["printing"] * (printer is not None)
     if left_out:
-        words = f"not judged: {' and '.join(left_out)}, which takes about {needed_mb:,.0f} MB, more than memory_mb leaves"
+        words = f"not judged: {' and '.join(left_out)}, which takes about {takes_mb:,.0f} MB, more than memory_mb leaves"
         found.append(finding("left-out", len(left_out), words, severities=severities))
     if printer is not None and judged.fit and fits:
         printed = check_printing(Solid.from_surface(read.surface), printer, up=up, severities=severities)

@@ -1,7 +1,7 @@
 """`Solid`: a surface that bounds a volume. It cannot exist unless every check passed, so what takes one need not check again.
 
 Closed, manifold at edges and vertices, consistently wound and outward, of positive volume, without faces that cross or overlap, and
-accepted by manifold3d, whose word is last.
+accepted by manifold3d, whose word is last; where memory was bounded and has no room for it, the verdict says that it was left out.
 """
 
 from __future__ import annotations
@@ -10,9 +10,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from rangecheck import memory
 from rangecheck.errors import NotSolid
 from rangecheck.solid import checks
-from rangecheck.solid.engine import to_engine
+from rangecheck.solid.engine import needed_mb, to_engine
 from rangecheck.solid.findings import Finding, Verdict, finding, verdict
 from rangecheck.surface import topology as topo
 from rangecheck.surface.surface import Surface
@@ -109,7 +110,13 @@ def check_solid(
     if intersections:
         found += checks.meetings(surface, severities)
     if engine and closed and len(surface.faces):
-        found += _engine_word(surface, severities)
+        takes_mb = needed_mb(len(surface.faces))
+        if takes_mb <= memory.left_mb():
+            found += _engine_word(surface, severities)
+        else:
+            facts["engine_asked"] = False
+            words = f"not judged: manifold3d, which takes about {takes_mb:,.0f} MB, more than memory_mb leaves"
+            found.append(finding("left-out", 1, words, severities=severities))
     return verdict(found, facts)
 
 
