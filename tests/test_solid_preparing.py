@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from rangecheck_cli.main import cli
+from rangecheck_cli.main import cli, exit_status
 from test_check_printing import CUP, turned
 from test_solid_repair import BALL, ball
 from test_topology import grid, torus
@@ -68,6 +68,15 @@ def test_with_little_memory_a_solid_is_proved_without_manifold3d_and_what_only_t
     assert made.solid is not None and "manifold3d" in made.verdict.get("left-out").message
     with pytest.raises(SettingError, match=r"solid.wall_mm, solid.base of .* faces takes about .* MB, and memory_mb leaves 0"):
         make_solid(BALL, load_settings(None, (), {"solid.wall_mm": 2.0}), Reporter())
+
+
+def test_a_solid_that_does_not_fit_into_memory_is_refused_in_one_line_before_anything_is_computed(tmp_path, monkeypatch, capsys):
+    write_mesh(BALL, tmp_path / "ball.ply")
+    monkeypatch.setattr("rangecheck.pipeline.shape.BYTES_A_FACE", 1e9)
+    line = ["solid", str(tmp_path / "ball.ply"), "-o", str(tmp_path / "ball.stl"), "--memory-mb", "8000"]
+    assert exit_status(line) == 2
+    assert "MB to prove, write and read back, and memory_mb leaves" in capsys.readouterr().err.splitlines()[-1]
+    assert not (tmp_path / "ball.stl").exists()
 
 
 def test_bodies_that_run_into_each_other_are_united_to_their_closed_form():
