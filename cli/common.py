@@ -125,7 +125,7 @@ _OPTIONS: dict[str, Callable[..., Any]] = {
     "memory": click.option(
         "--memory-mb",
         type=click.FloatRange(256),
-        help="Most memory to take, with all that is started, as of the setting memory_mb; what needs more ends and says so.",
+        help="Most memory to take, in MB, with all that is started; over the setting memory_mb. What needs more ends and says so.",
     ),
     "json": click.option("--json", "as_json", is_flag=True, help="Print one JSON document on stdout and nothing else."),
     "log": click.option(

@@ -164,7 +164,7 @@ class ScanQuality:
         """The verdict and what it rests on, in sentences."""
         lines = [
             f"{self.verdict} for {self.profile.name} ({self.profile.height_mm:g} mm high in layers of {self.profile.layer_mm:g} mm)",
-            f"{len(self.views)} scans see {100 * self.seen:.1f} % of the surface in reach; samples {self.spacing_mm:.2f} mm apart, expected error "
+            f"{len(self.views)} {'scan sees' if len(self.views) == 1 else 'scans see'} {100 * self.seen:.1f} % of the surface in reach; samples {self.spacing_mm:.2f} mm apart, expected error "
             f"{self.error_mm:.3f} mm; at the print {self.scale * self.spacing_mm:.2f} and {self.scale * self.error_mm:.3f} mm",
         ]
         lines += [f"{f.severity}: {f.text}" for f in self.findings]
