@@ -7,7 +7,9 @@ import pytest
 
 from rangecheck import kernels, rigid
 from rangecheck.errors import InputError, SceneError
+from rangecheck.export.legend import NOTHING
 from rangecheck.export.map_files import read_maps_npz, write_maps, write_maps_npz
+from rangecheck.export.mapped import coloured_normals
 from rangecheck.export.pictures import read_map_png16, read_png
 from rangecheck.maps import back_projection_error, trace_maps, winding_number
 from rangecheck.maps.proof import point_triangle_mm
@@ -201,8 +203,18 @@ def test_maps_come_back_from_their_files(tmp_path):
     assert np.nanmax(np.abs(values - maps.distance_mm)) <= 0.5001 * scale["step"]
     assert (np.isnan(values) == ~maps.hit).all()
     assert (read_png(tmp_path / "front_part_id_16bit.png") == maps.part_id).all()
+    normals, scale = read_map_png16(tmp_path / "front_normals_16bit.png")
+    assert scale["quantity"] == "normal" and (np.isnan(normals).all(axis=2) == ~maps.hit).all()
+    assert np.nanmax(np.abs(normals - maps.normals)) <= 0.5001 * scale["step"]
     write_maps_npz(tmp_path / "again.npz", maps)
     assert (tmp_path / "again.npz").read_bytes() == (tmp_path / "front_maps.npz").read_bytes()
+
+
+def test_the_picture_of_normals_has_the_colour_of_each_axis_and_nothing_where_nothing_is():
+    normals = np.full((1, 4, 3), np.nan)
+    normals[0, :3] = np.eye(3)
+    shown = {tuple(colour) for colour in coloured_normals(normals, "Normals", picture_px=400).reshape(-1, 3).tolist()}
+    assert {(255, 128, 128), (128, 255, 128), (128, 128, 255), NOTHING} <= shown
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 not a zip", b"plain text"])

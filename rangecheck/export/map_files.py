@@ -16,8 +16,8 @@ from rangecheck.arrays import FloatArray, IntArray
 from rangecheck.errors import InputError, RangecheckError
 from rangecheck.export.legend import NOTHING as NOTHING_COLOUR
 from rangecheck.export.legend import Swatches, framed, span_text
-from rangecheck.export.mapped import coloured_ids, coloured_map, contour_picture, range_of
-from rangecheck.export.pictures import write_id_png16, write_map_png16, write_png
+from rangecheck.export.mapped import coloured_ids, coloured_map, coloured_normals, contour_picture, range_of
+from rangecheck.export.pictures import write_id_png16, write_map_png16, write_normals_png16, write_png
 from rangecheck.files import read_bytes, whole_file, write_json
 from rangecheck.maps import Chain, Maps, Shadows
 from rangecheck.maps.shadow import LIT, NOTHING, SHADED, STATE_NAMES, TURNED_AWAY
@@ -89,8 +89,8 @@ def write_maps(
     more: Mapping[str, FloatArray] | None = None,
     force: bool = True,
 ) -> list[Path]:
-    """All files of one set of maps in `folder`, their names led by `stem`: maps.npz (with `more` maps), distance, depth, incidence
-    and part_id as *_16bit.png and coloured .png, and contours.png. Returns the paths."""
+    """All files of one set of maps in `folder`, their names led by `stem`: maps.npz (with `more` maps), distance, depth, incidence,
+    normals and part_id as *_16bit.png and coloured .png, and contours.png. Returns the paths."""
     where = Path(folder)
     written: list[Path] = []
 
@@ -108,6 +108,8 @@ def write_maps(
     for name, values, unit, title, colours in floats:
         write_map_png16(named(f"{name}_16bit.png"), values, name, unit, force=force)
         write_png(named(f"{name}.png"), coloured_map(values, title, unit, subtitle=subtitle, colours=colours), force=force)
+    write_normals_png16(named("normals_16bit.png"), maps.normals, force=force)
+    write_png(named("normals.png"), coloured_normals(maps.normals, "Normals"), force=force)
     if len(maps.part_names) <= 65535:
         write_id_png16(named("part_id_16bit.png"), maps.part_id, maps.part_names, force=force)
         picture = coloured_ids(maps.part_id, maps.part_names, "Surface seen first", subtitle=subtitle)

@@ -67,6 +67,19 @@ def coloured_map(
     return legend.framed(picture, title, subtitle, legend.ColourScale(low, high, unit, colours))
 
 
+def coloured_normals(normals: FloatArray, title: str, *, picture_px: int = PICTURE_PX) -> Picture:
+    """Picture (H, W, 3) of unit normals (h, w, 3), NaN where nothing is seen: red x, green y, blue z, from -1 to 1."""
+    array = require("normals", normals, (None, None, 3))
+    seen = np.isfinite(array).all(axis=2)
+    picture = np.full(array.shape, legend.NOTHING, np.uint8)
+    picture[seen] = np.rint(127.5 * (array[seen] + 1.0))
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    swatches = legend.Swatches(np.rint(127.5 * (axes + 1.0)).astype(np.uint8), ("+x", "+y", "+z", "-x", "-y", "-z"))
+    return legend.framed(
+        _enlarged(picture, _zoom(seen.shape, picture_px)), title, "where each colour faces, world axes", swatches
+    )
+
+
 def coloured_ids(
     ids: IntArray,
     names: Sequence[str],

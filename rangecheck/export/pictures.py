@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import io
 import json
+import struct
+import zlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -89,13 +91,15 @@ def _checked(radiance: FloatArray) -> FloatArray:
 
 
 def png_bytes(picture: npt.NDArray[Any], text: Mapping[str, str] | None = None) -> bytes:
-    """PNG file of uint8 (h, w), (h, w, 3), (h, w, 4) or uint16 (h, w), with `text` as its metadata."""
+    """PNG file of uint8 (h, w), (h, w, 3), (h, w, 4) or uint16 (h, w), (h, w, 3), with `text` as its metadata."""
     from PIL import Image, PngImagePlugin
 
     if picture.dtype not in (np.uint8, np.uint16) or picture.size == 0:
         raise ArrayError(f"picture is {picture.dtype} of shape {picture.shape}; PNG holds uint8 or uint16", name="picture")
     if not text and (picture.ndim == 2 or picture.shape[2] == 3):
         return _plain_png(picture)
+    if picture.dtype == np.uint16 and picture.ndim == 3:  # which Pillow neither writes nor reads
+        return _with_text(_plain_png(picture), text or {})
     info = PngImagePlugin.PngInfo()
     for key, value in (text or {}).items():
         info.add_text(key, value)
@@ -111,6 +115,15 @@ def _plain_png(picture: npt.NDArray[Any]) -> bytes:
     channels = picture if picture.ndim == 2 else picture[..., ::-1]
     encoded = cv2.imencode(".png", np.ascontiguousarray(channels), [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
     return encoded.tobytes()
+
+
+def _with_text(png: bytes, text: Mapping[str, str]) -> bytes:
+    """The PNG with text chunks behind its header, which is 8 bytes of magic and a chunk of 25."""
+    chunks = b""
+    for key, value in text.items():
+        body = b"tEXt" + key.encode("latin-1") + b"\0" + value.encode("latin-1")
+        chunks += struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
+    return png[:33] + chunks + png[33:]
 
 
 def write_png(path: str | Path, picture: npt.NDArray[Any], text: Mapping[str, str] | None = None, *, force: bool = True) -> None:
@@ -148,6 +161,18 @@ def write_map_png16(
     return offset, step
 
 
+def write_normals_png16(path: str | Path, normals: FloatArray, *, force: bool = True) -> None:
+    """Unit normals (h, w, 3) as 16-bit colours, red x, green y, blue z: value = offset + step * number, number 0 = none (NaN). The scale
+    stands in the file as that of `write_map_png16`."""
+    array = require("normals", normals, (None, None, 3))
+    known = np.isfinite(array).all(axis=2)
+    step = 2.0 / 65534
+    numbers = np.zeros(array.shape, np.uint16)
+    numbers[known] = np.rint((array[known].astype(np.float64) + 1.0) / step + 1.0)
+    scale = {"quantity": "normal", "unit": "1", "offset": -1.0 - step, "step": step, "none": 0, "channels": ["x", "y", "z"]}
+    write_png(path, numbers, {"rangecheck": json.dumps(scale, sort_keys=True)}, force=force)
+
+
 def write_id_png16(path: str | Path, ids: npt.NDArray[Any], names: Iterable[str], *, force: bool = True, **more: Any) -> None:
     """An ID map (h, w) of integers 0..65535 as 16-bit PNG, exact; 0 = none, ID k is the k-th of `names`."""
     numbers = require("ids", ids, (None, None), np.int64)
@@ -158,7 +183,8 @@ def write_id_png16(path: str | Path, ids: npt.NDArray[Any], names: Iterable[str]
 
 
 def read_map_png16(path: str | Path) -> tuple[FloatArray, dict[str, Any]]:
-    """(h, w) float64 values of a map PNG (NaN = none) and its scale. Raises InputError when the file states no scale."""
+    """(h, w) float64 values of a map PNG, (h, w, 3) of normals (NaN = none), and its scale. Raises InputError when the file states no
+    scale."""
     from PIL import Image
 
     numbers = read_png(path)
@@ -166,7 +192,18 @@ def read_map_png16(path: str | Path) -> tuple[FloatArray, dict[str, Any]]:
         text = getattr(image, "text", {}).get("rangecheck")
     try:
         scale = json.loads(text or "")
+        if scale.get("channels"):
+            numbers = _colours_16(path)
         values = scale["offset"] + scale["step"] * numbers.astype(np.float64)
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, AttributeError):
         raise InputError(path, "states no scale (text entry 'rangecheck' with offset and step); it is not a map") from None
     return np.where(numbers == 0, np.nan, values), scale
+
+
+def _colours_16(path: str | Path) -> npt.NDArray[np.uint16]:
+    import cv2
+
+    read = cv2.imdecode(np.frombuffer(read_bytes(path), np.uint8), cv2.IMREAD_UNCHANGED)
+    if read is None or read.dtype != np.uint16 or read.ndim != 3 or read.shape[2] != 3:
+        raise InputError(path, "is said to hold normals, and is no picture of three colours of 16 bits")
+    return read[..., ::-1]
