@@ -1,6 +1,8 @@
 """Mesh files of every kind come to the same surface, and what is wrong with a file is said in one line."""
 
 import struct
+import tracemalloc
+import zipfile
 
 import numpy as np
 import pytest
@@ -198,3 +200,15 @@ def test_the_zippered_bunny_is_as_open_as_it_is_known_to_be(real_data):
     assert len(topo.boundary_edges(bunny)) == 223 and len(topo.boundary_loops(bunny)) == 5
     assert len(topo.unreferenced_vertices(bunny)) == 1113
     assert 150 < np.ptp(bunny.vertices, axis=0).max() < 160
+
+
+def test_a_3mf_that_unpacks_to_many_times_its_size_is_refused_before_it_is_unpacked(tmp_path):
+    path = tmp_path / "bomb.3mf"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("3D/3dmodel.model", "w") as model:
+        for _ in range(40):
+            model.write(b'<vertex x="0" y="0" z="0"/>' * (1 << 15))
+    tracemalloc.start()
+    with pytest.raises(InputError, match=r"unpacks from \d+ to 35389440 bytes, more than 60 times"):
+        read_mesh(path)
+    assert tracemalloc.get_traced_memory()[1] < 4 << 20
+    tracemalloc.stop()

@@ -23,6 +23,8 @@ from rangecheck.surface.stl_files import stl_corners
 from rangecheck.surface.surface import Surface
 from rangecheck.surface.weld import weld_exactly
 
+#: how many times its size a 3MF may unpack to (meshes do to 6 to 8), and up to how many bytes that is not asked
+MOST_SWELLING, SWELLS_FREELY = 60, 1 << 25
 FORMATS = ("stl", "ply", "obj", "off", "glb", "3mf")
 #: float32, in which STL is written and rays are traced, holds squares of lengths up to 1.8e19 mm
 LARGEST_MM = 1e18
@@ -213,12 +215,29 @@ def _off(path: Path, content: bytes) -> tuple[FloatArray, IntArray]:
     return vertices, _numbered(path, faces)
 
 
+def _refuse_to_swell(path: Path, content: bytes) -> None:
+    """Refuse an archive that unpacks to many times what lists of numbers pack to, before it is unpacked: its reader holds it whole."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            unpacked = sum(member.file_size for member in archive.infolist())
+    except (zipfile.BadZipFile, ValueError, OverflowError, OSError) as error:
+        raise InputError(path, f"cannot be read as 3MF ({error}); export it again") from None
+    if unpacked > max(SWELLS_FREELY, MOST_SWELLING * len(content)):
+        raise InputError(
+            path,
+            f"unpacks from {len(content)} to {unpacked} bytes, more than {MOST_SWELLING} times, which no mesh does; export it again",
+            unpacked=unpacked,
+        )
+
+
 def _through_trimesh(path: Path, content: bytes, kind: str) -> tuple[FloatArray, IntArray, str]:
     """Vertices, faces and unit of GLB or 3MF, all instances placed by their transforms."""
     try:
         import trimesh
     except ImportError:
         raise DependencyMissing("trimesh", f"reading {kind.upper()}", "pip install trimesh") from None
+    if kind == "3mf":
+        _refuse_to_swell(path, content)
     try:
         scene = trimesh.load_scene(io.BytesIO(content), file_type=kind)
         mesh = scene.to_mesh() if scene.geometry else None
