@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import numba
 import numpy as np
 import pytest
 
@@ -12,6 +13,7 @@ from rangecheck.reflectance import GREY_UM, Material
 from rangecheck.scene import DARKNESS, Scene, Softbox, Source, constant, gradient, panorama, stripes, studio
 from rangecheck.surface import Surface
 from rangecheck.surface.surface import join
+from rangecheck.transport.reflection import materials_of
 
 PLASTER = Material("white", K_lm=0.9, wavelengths_um=GREY_UM)
 
@@ -184,3 +186,11 @@ def test_a_studio_says_what_it_knows():
         studio(tetrahedron(), PLASTER, "stell")
     with pytest.raises(SceneError, match="point the same way"):
         studio(tetrahedron(), PLASTER, "steel", front=(0, 1, 0))
+
+
+def test_whatever_a_scene_is_made_of_its_stages_are_compiled_once():
+    """A kernel is compiled for each type of its arguments, and an array that may be written is of another type than one that may not."""
+    metal = Material("metal", K_s=0.6, sigma_um=0.02, correlation_um=3.0, wavelengths_um=GREY_UM)
+    assert len({numba.typeof(materials_of(some)) for some in ([PLASTER], [metal], [PLASTER, metal])}) == 1
+    around = (DARKNESS, constant(0.3), gradient(0.1, 0.5), stripes(0.0, 1.0, 20.0), panorama(np.ones((4, 8, 1))))
+    assert len({numba.typeof(some.arrays(channels)) for some in around for channels in (1, 3)}) == 1

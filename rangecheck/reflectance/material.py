@@ -202,8 +202,10 @@ def stack_tables(materials: Sequence[Material]) -> MaterialTables:
             row[VISIBILITY:FRESNEL] = visibility_table(roughness, reach, masking, material.bounded and lobe > 0.0)
             row[FRESNEL:] = _fresnel_table(*material.index_at(wavelength))
     surfaces.flags.writeable = False
-    # matt surfaces have no lobe to look up, and need not wait for the table
-    return MaterialTables(surfaces, lobe_table() if (surfaces[..., K_LOBE] > 0).any() else np.zeros((0, 0, 0)))
+    # matt surfaces have no lobe to look up, and need not wait for the table; read-only like it, so that stages are compiled once
+    none = np.zeros((0, 0, 0))
+    none.flags.writeable = False
+    return MaterialTables(surfaces, lobe_table() if (surfaces[..., K_LOBE] > 0).any() else none)
 
 
 _fresnel_table = lru_cache(maxsize=256)(fresnel_table)

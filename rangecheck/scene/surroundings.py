@@ -113,7 +113,10 @@ class Surroundings:
         def spread(name: str, values: FloatArray) -> FloatArray:
             if values.shape[-1] not in (1, channels):
                 raise SceneError(f"{name} has {values.shape[-1]} wavelengths and the scene has {channels}; give 1 or {channels}")
-            return np.ascontiguousarray(np.broadcast_to(values, values.shape[:-1] + (channels,)))
+            # read-only whatever they come from, so that stages are compiled once
+            whole = np.ascontiguousarray(np.broadcast_to(values, values.shape[:-1] + (channels,))).view()
+            whole.flags.writeable = False
+            return whole
 
         picture = self.picture if self.picture is not None else np.zeros((1, 1, 1), np.float32)
         return SurroundingsArrays(
