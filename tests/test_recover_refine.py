@@ -104,15 +104,68 @@ def test_paint_is_not_taken_for_shape(clean):
 
 
 def test_folds_as_narrow_as_cells_are_not_taken_for_paint():
+    from rangecheck.raycast.implicit import ImplicitCaster
     from rangecheck.studies.fit_refine import bust_picture, judged
+    from rangecheck.studies.slopes import one_surface
 
     made, scan = bust_picture(35.0, 77, step=2)
     out = refine(scan)
     assert out.painted.sum() < 0.05 * scan.valid.sum() and out.refined.sum() > 0.75 * scan.valid.sum()
-    numbers = judged(made, scan, out)
+    numbers = judged(made, scan, out, one_surface(made, ImplicitCaster.of_bust()))
     # coarse cells hide folds even from the true ranges' differences: what noise adds to that is halved
     before, after, exact = (numbers[f"surface_{when}_deg"] for when in ("before", "after", "exact"))
     assert after**2 - exact**2 < 0.5**2 * (before**2 - exact**2)
+
+
+def test_a_slope_is_taken_on_the_own_surface_up_to_the_edge_before_another():
+    """A ball before a wall: differences across its outline tilt by tens of degrees, those on one surface by what a cell's chord misses of the ball."""
+    from rangecheck.raycast import Hits
+    from rangecheck.scan.simulate import RangeFinder, simulate_scan
+    from rangecheck.studies.fit_refine import slope_errors_deg
+    from rangecheck.studies.slopes import one_surface, surface_slope_errors_deg
+
+    centre, radius, wall = np.array([0.0, 0.0, 400.0]), 30.0, 460.0
+
+    class BallAndWall:
+        skin_mm = 1e-9
+
+        def closest(self, origins_mm, directions, *, coherent=False):
+            away = origins_mm - centre
+            b, c = (away * directions).sum(1), (away * away).sum(1) - radius**2
+            inside = b * b - c
+            ball = np.where(inside > 0, -b - np.sqrt(np.maximum(inside, 0)), np.inf)
+            ball[ball < 0] = np.inf
+            back = (wall - origins_mm[:, 2]) / directions[:, 2]
+            distance = np.minimum(ball, np.where(back > 1e-9, back, np.inf))
+            none = np.zeros(len(distance), np.float32)
+            return Hits(distance, np.where(np.isfinite(distance), 0, -1).astype(np.int32), none, none)
+
+        def occluded(self, origins_mm, directions, reach_mm=np.inf, *, coherent=False):
+            return self.closest(origins_mm, directions).distance_mm < reach_mm
+
+        def normals(self, points_mm):
+            on_ball = points_mm[:, 2] < wall - 1e-6
+            away = (points_mm - centre) / radius
+            return np.where(on_ball[:, None], away, np.array([0.0, 0.0, -1.0]))
+
+    camera = PinholeCamera.from_field_of_view(80, 80, 12.0)
+    finder = RangeFinder(working_distance_mm=400.0, noise_mm=0.0, step_mm=0.0, lost_share=0.0)
+    made = simulate_scan(BallAndWall(), camera, np.eye(4), finder, 1)
+    joined = one_surface(made, BallAndWall())
+    exact = replace(made.scan, range_mm=made.true_range_mm.astype(np.float32))
+    made = replace(made, scan=exact)
+    across, along = slope_errors_deg(exact, made), surface_slope_errors_deg(exact, made, joined)
+    on_ball = made.true_range_mm < 400.0
+    facing = -(made.true_normal * camera.pixel_rays()[1]).sum(-1)
+    assert np.nanmax(across) > 30.0
+    # one cell beyond, on a ball seen at this slant, the tangent has turned by no more than this
+    cell = 400.0 * np.linalg.norm(np.diff(camera.pixel_rays()[1][40, 40:42], axis=0))
+    seen = np.isfinite(along) & (facing > 0.3)
+    assert np.nanmax(along[seen]) < np.degrees(cell / 0.3 / radius)
+    assert np.nanmax(along[~on_ball]) < 0.1
+    # parted all along the outline, joined everywhere else
+    row = joined[0][40]
+    assert (~row & np.isfinite(made.true_range_mm[40, 1:])).sum() == 2
 
 
 def test_much_paint_is_refused_and_so_is_a_scan_without_a_picture(clean):

@@ -1,8 +1,9 @@
 """Shape refined by shading, against truth: slopes and heights of the sample bust's scans before and after, clean and painted.
 
-The sample range finder (0.2 mm of noise, 640 x 480) sees the bust from three sides; its picture has 1 % of full scale of Gaussian noise. Slopes are those of
-central differences on the grid, errors angles to the true normal: of all cells, and of those whose neighbours lie on the same surface, as differences across
-a depth step are no slope. Where folds are as narrow as cells even the true ranges' differences miss the true normals: by how much is said too.
+The sample range finder (0.2 mm of noise, 640 x 480) sees the bust from three sides; its picture has 1 % of full scale of Gaussian noise. Errors of slope are
+angles to the true normal. Slopes of all cells are differences to their neighbours on the same surface, which truth tells (`slopes`): a difference across a
+depth step is no slope. The cells are those between four that returned, and, told apart, those at rims too. Beside them stand central differences whatever lies
+between the neighbours, of the same cells, and of those whose neighbours the ranges themselves put on one surface. Where folds are as narrow as cells even the true ranges' differences miss the true normals: by how much is said too.
 Heights are compared in windows of 16 x 16 cells, wherever a quarter of them is measured. The seeds are none that the method was made on.
 """
 
@@ -14,18 +15,19 @@ from typing import Any
 
 import numpy as np
 
-from rangecheck.arrays import FloatArray
+from rangecheck.arrays import BoolArray, FloatArray
 from rangecheck.errors import ScanError
 from rangecheck.recover.refine import Refined, linked, refine
 from rangecheck.scan import RangeScan
 from rangecheck.scan.sample import CAMERA, FINDER, TARGET_MM
 from rangecheck.scan.simulate import Finish, SimulatedScan, ring_of_poses, simulate_scan
+from rangecheck.studies.slopes import one_surface, surface_slope_errors_deg
 from rangecheck.study import Line, LineChart
 
 #: share of light that the bust gives back, and noise of its picture
 ALBEDO, PICTURE_NOISE = 0.7, 0.01
 _WINDOW = 16
-_FRESH = 500
+_FRESH = 88500
 
 
 def bust_picture(azimuth_deg: float, seed: int, *, spots: int = 0, step: int = 1) -> tuple[SimulatedScan, RangeScan]:
@@ -76,15 +78,14 @@ def window_ratios(before: FloatArray, after: FloatArray) -> FloatArray:
     return np.array(found)
 
 
-def judged(made: SimulatedScan, scan: RangeScan, refined: Refined) -> dict[str, float]:
-    """Errors before and after: slopes of all cells, of those on one surface with their neighbours and of those that the picture refined, each beside the true
-    ranges' own; heights; the worst and the middle window."""
+def judged(made: SimulatedScan, scan: RangeScan, refined: Refined, joined: tuple[BoolArray, BoolArray]) -> dict[str, float]:
+    """Errors before and after, each beside the true ranges' own: slopes on the own surface, of which `joined` tells, of all cells between four ("own") and of
+    those at rims too ("rims"); central differences of all cells between four, of those on one surface with their neighbours and of those that the picture
+    refined; heights; the worst and the middle window."""
     exact = replace(scan, range_mm=np.where(scan.valid, made.true_range_mm, np.nan).astype(np.float32))
-    errors = {
-        "before": slope_errors_deg(scan, made),
-        "after": slope_errors_deg(refined.scan, made),
-        "exact": slope_errors_deg(exact, made),
-    }
+    taken = {"before": scan, "after": refined.scan, "exact": exact}
+    errors = {when: slope_errors_deg(one, made) for when, one in taken.items()}
+    on_own = {when: surface_slope_errors_deg(one, made, joined) for when, one in taken.items()}
     known = np.isfinite(errors["before"]) & np.isfinite(errors["after"])
     chosen = {"all": known, "surface": known & linked(scan, refined.noise_mm), "refined": known & refined.refined}
     high, low = scan.range_mm - made.true_range_mm, refined.scan.range_mm - made.true_range_mm
@@ -94,6 +95,11 @@ def judged(made: SimulatedScan, scan: RangeScan, refined: Refined) -> dict[str, 
         f"{name}_{when}_deg": _rms(error[which]) if which.any() else math.nan
         for name, which in chosen.items() for when, error in errors.items()
     }  # fmt: skip
+    rims = np.isfinite(on_own["before"]) & np.isfinite(on_own["after"])
+    slopes |= {
+        f"{name}_{when}_deg": _rms(error[which]) for name, which in (("own", rims & known), ("rims", rims)) for when, error in on_own.items()
+    }  # fmt: skip
+    slopes |= {"own_cells": int((rims & known).sum()), "rims_cells": int(rims.sum())}
     return slopes | {
         "cells": int(chosen["refined"].sum()), "height_before_mm": _rms(high[both]), "height_after_mm": _rms(low[both]),
         "worst_window": float(ratios.max()), "middle_window": float(np.median(ratios)), "windows": len(ratios),
@@ -107,6 +113,8 @@ def _rms(values: FloatArray) -> float:
 
 def refinement(quick: bool) -> tuple[list[Any], list[str], list[dict[str, Any]]]:
     """The part `refine` of the study `fit`."""
+    from rangecheck.raycast.implicit import ImplicitCaster
+
     step = 2 if quick else 1
     cases = [(20.0, 0), (20.0, 3)] if quick else [(20.0, 0), (20.0, 3), (20.0, 40), (-60.0, 0), (100.0, 0)]
     rows: list[dict[str, Any]] = []
@@ -122,10 +130,13 @@ def refinement(quick: bool) -> tuple[list[Any], list[str], list[dict[str, Any]]]
             findings.append(f"{name}: refused; {refusal}")
             continue
         alone = refine(scan, use_picture=False)
-        numbers, without = judged(made, scan, refined), judged(made, scan, alone)
+        joined = one_surface(made, ImplicitCaster.of_bust())
+        numbers, without = judged(made, scan, refined, joined), judged(made, scan, alone, joined)
         rows.append(row | numbers | {"without_picture_deg": without["surface_after_deg"]})
         findings += [
-            f"{name}: slope error of cells on one surface with their neighbours {_told(numbers, 'surface')}, without the picture times "
+            f"{name}: slope error on the own surface {_told(numbers, 'own')}, of the {numbers['own_cells'] / scan.valid.sum():.0%} between four that returned; "
+            f"of {numbers['rims_cells'] / scan.valid.sum():.0%}, rims and all, {_told(numbers, 'rims')}",
+            f"  central differences: of cells on one surface with their neighbours {_told(numbers, 'surface')}, without the picture times "
             f"{without['surface_after_deg'] / numbers['surface_before_deg']:.3f}; of all cells, steps and all, {_told(numbers, 'all')}; of the "
             f"{numbers['cells'] / scan.valid.sum():.0%} that the picture refined {_told(numbers, 'refined')}",
             f"  heights {numbers['height_before_mm']:.4f} to {numbers['height_after_mm']:.4f} mm rms; of {numbers['windows']} windows "
@@ -137,7 +148,8 @@ def refinement(quick: bool) -> tuple[list[Any], list[str], list[dict[str, Any]]]
     lines = [
         Line(label, cases_shown, [r[f"{key}_{when}_deg"] / r[f"{key}_before_deg"] for r in kept], True)
         for label, key, when in (
-            ("slopes on one surface", "surface", "after"), ("slopes of all cells", "all", "after"), ("all cells of the true ranges", "all", "exact"),
+            ("slopes on the own surface", "own", "after"), ("rims and all", "rims", "after"), ("of the true ranges", "own", "exact"),
+            ("central differences, steps and all", "all", "after"),
         )
     ]  # fmt: skip
     lines.append(Line("worst window of heights", cases_shown, [r["worst_window"] for r in kept], True))
