@@ -99,7 +99,9 @@ def test_a_verdict_that_says_no_holds_the_stl_back(tmp_path):
 def bunny_job(real_data, tmp_path_factory) -> Path:
     """The finished job on the ten scans of the Stanford bunny."""
     out = tmp_path_factory.mktemp("bunny") / "bunny"
-    assert exit_status(["run", str(real_data / "stanford_bunny" / "bun.conf"), "--unit", "m", "--out", str(out), *SMALL]) == 0
+    line = ["run", str(real_data / "stanford_bunny" / "bun.conf"), "--unit", "m", "--out", str(out), *SMALL]
+    # what the scans are worth and what steel shows is tested of others; here it is the shape
+    assert exit_status([*line, "--set", "scan.quality=false", "--set", 'light.materials=["plaster"]']) == 0
     return out
 
 
