@@ -58,7 +58,7 @@ class Sight:
 
     def spread(self, values: FloatArray, fill: float = np.nan) -> FloatArray:
         """Values (n, ...) put back into a picture (h, w, ...), `fill` where nothing is seen."""
-        picture = np.full((self.shape[0] * self.shape[1], *values.shape[1:]), fill)
+        picture = np.full((self.shape[0] * self.shape[1], *values.shape[1:]), float(fill))
         picture[self.pixel] = values
         return picture.reshape(*self.shape, *values.shape[1:])
 
