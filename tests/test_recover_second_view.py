@@ -8,6 +8,8 @@ import pytest
 from rangecheck import rigid
 from rangecheck.errors import ScanError
 from rangecheck.optics import PinholeCamera
+from rangecheck.recover.carried import carried
+from rangecheck.recover.dents import dents
 from rangecheck.recover.second_view import jumps, second_view
 from rangecheck.scan import RangeScan
 from rangecheck.scan.decode import View
@@ -58,6 +60,28 @@ def test_a_dent_is_named_at_its_place_and_nothing_else(pair):
     assert found.regions
     assert all(np.linalg.norm(scan.grid_points_mm[r.cell] - place) < 13.0 for r in found.regions)
     assert {r.kind for r in found.regions} == {"shape"}
+
+
+def test_a_narrow_dent_is_named_with_its_depth_at_its_middle(pair):
+    scan, picture, view = pair
+    place = scan.grid_points_mm[100, 140]
+    found = second_view(dented(scan, place, 1.0, 4.0), picture, view)
+    assert len(found.regions) == 1 and found.regions[0].kind == "shape"
+    row, column = found.regions[0].cell
+    # places are tried 1.5 mm apart
+    assert np.linalg.norm(scan.grid_points_mm[row, column] - place) < 2.0
+    # what has to be undone: the range is too long
+    assert found.dents.amount_mm[row, column] == pytest.approx(-1.0, abs=0.2)
+
+
+def test_dents_are_judged_where_paint_shows_and_not_where_there_is_none(pair):
+    scan, picture, view = pair
+    rng = np.random.default_rng(3)
+    grey, bare = (0.4 * (1.0 + rng.normal(0.0, 0.01, (SIZE, SIZE))) for _ in range(2))
+    of_paint = dents(carried(scan, picture, view, 1))
+    of_none = dents(carried(replace(scan, brightness=bare.astype(np.float32)), grey, view, 1))
+    assert min(of_paint.judged) > 0.6 and not of_paint.named.any()
+    assert of_none.judged == (0.0, 0.0, 0.0) and not of_none.named.any()
 
 
 def test_a_step_is_named_on_its_line_as_one_of_registration(pair):

@@ -167,7 +167,7 @@ def _documents() -> dict[str, tuple[Any, ...]]:
         file=TEXT, kind=one_of("scans"), scans=many(ref("scan")), fit=FLAG, registration=or_null(ref("registration")), filtered=maybe(TEXTS),
         quality=or_null(ref("quality")), findings=many(ref("finding")),
         pictures=many(record(name=TEXT, by=one_of("second picture", "shading", "none"), judged=NUMBER, least_mm=maybe(or_null(NUMBER)),
-                             paint=maybe(NUMBER), refused=maybe(TEXT), regions=regions)),
+                             dents=maybe(many(record(radius_mm=NUMBER, judged=NUMBER))), paint=maybe(NUMBER), refused=maybe(TEXT), regions=regions)),
     )  # fmt: skip
     posed = record(picture=TEXT, world_from_camera=POSE)
     view = {"camera": ref("camera"), "world_from_camera": maybe(POSE)}

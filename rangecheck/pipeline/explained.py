@@ -20,6 +20,8 @@ from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.subject import hashes, holds_capture, read_all_scans
 from rangecheck.progress import Reporter
 from rangecheck.recover.compare import JUDGED_MM, Comparison, compare
+from rangecheck.recover.dents import JUDGED_MM as DENT_MM
+from rangecheck.recover.dents import RADII_MM
 from rangecheck.recover.regions import AGAINST_SHAPE, Region
 from rangecheck.recover.second_view import Agreement, second_view
 from rangecheck.scan import RangeScan
@@ -27,6 +29,8 @@ from rangecheck.solid.findings import Finding, finding
 
 #: cells of the grid on which scan and picture are compared, about
 _CELLS = 400_000
+#: the same of a second picture, which finer paint tells more
+_SECOND_CELLS = 900_000
 #: regions told of in lines; the document has all
 _TOLD = 12
 _CODE = "scan-contradicts-picture"
@@ -83,13 +87,16 @@ def _by_second_picture(path: str | Path, scan: RangeScan) -> tuple[dict[str, Any
     assert scan.brightness is not None
     linear = replace(scan, brightness=sensor.linearise(scan.brightness).astype(np.float32))
     right = sensor.linearise(capture.right.white / capture.right.full_scale)
-    found: Agreement = second_view(linear, right, capture.right_view, step=_step(scan))
+    found: Agreement = second_view(linear, right, capture.right_view, step=_step(scan, _SECOND_CELLS))
+    whole = ", ".join(f"{share:.0%} ({radius:g} mm)" for share, radius in zip(found.dents.judged, RADII_MM))
     said = [
         f"{scan.name}: {found.judged:.0%} of it held against the second camera's picture, where steps of {found.level_mm:.2f} mm are named; elsewhere the "
-        "two pictures have too little in common",
+        f"two pictures have too little in common; dents of {DENT_MM:g} mm would be named on {whole} of it, by radius",
         *_places(found.regions),
     ]
-    return {"by": "second picture", "judged": found.judged, "least_mm": found.level_mm}, found.regions, said
+    judged_dents = [{"radius_mm": radius, "judged": share} for share, radius in zip(found.dents.judged, RADII_MM)]
+    about = {"by": "second picture", "judged": found.judged, "least_mm": found.level_mm, "dents": judged_dents}
+    return about, found.regions, said
 
 
 def _by_shading(scan: RangeScan) -> tuple[dict[str, Any], tuple[Region, ...], list[str]]:
@@ -152,8 +159,8 @@ def fit_scan(
     return Outcome(document("explained", fit=fit, scans=results, inputs=hashes([path]), seconds=reporter.seconds), lines, fit)
 
 
-def _step(scan: RangeScan) -> int:
-    return max(1, round(float(np.sqrt(scan.range_mm.size / _CELLS))))
+def _step(scan: RangeScan, cells: int = _CELLS) -> int:
+    return max(1, round(float(np.sqrt(scan.range_mm.size / cells))))
 
 
 def compared(scan: RangeScan, response: str, scale_mm: float | None = None) -> Comparison:

@@ -5,25 +5,26 @@ A range that is wrong by d moves its place in the second picture along the epipo
 in logarithms of light, correlate best over a Gaussian window (normalised cross-correlation, so that each window has its own gain), between the offsets
 tried by a parabola. Where paint has no structure, or the cameras see a gloss, they do not correlate and the place is not judged.
 
-Places are named by the jump of d: the largest difference between its means over two halves of a disc, over all directions. Slow changes of d are the
+Steps are named by the jump of d: the largest difference between its means over two halves of a disc, over all directions. Slow changes of d are the
 calibration's; a dent has a ring of jumps, two badly joined pieces a line of them. The noise is that of the jump over the picture itself (median
 absolute), and the level is Bonferroni's for as many places as discs fit into what is judged. Its tails are longer than a normal one's, so nothing below
-LEAST_MM is named either. Where a false shape changes much within one window, the pictures no longer correlate and the place drops out of what is judged: narrow
-deep dents are missed more often than steps (the study `fit`, part `alexander`, counts them). Scan frame, millimetres.
+LEAST_MM is named either. Where a false shape changes much within one window, the pictures no longer correlate and the place drops out of what is judged: whole
+dents are therefore looked for by filters of their own shape (`dents`), which judge more of the scan. Scan frame, millimetres.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import NormalDist
 
 import numpy as np
 
-from rangecheck import rigid
-from rangecheck.arrays import BoolArray, FloatArray
+from rangecheck.arrays import FloatArray
 from rangecheck.errors import ScanError
-from rangecheck.recover.grid import scan_grid
+from rangecheck.recover.carried import carried
+from rangecheck.recover.dents import Dents, dents
+from rangecheck.recover.grid import ScanGrid
 from rangecheck.recover.regions import Region, inner, regions_of
 from rangecheck.scan import RangeScan
 from rangecheck.scan.decode import View
@@ -41,8 +42,8 @@ _NORMAL_MAD = 0.6744897501960817
 @dataclass(frozen=True, eq=False)
 class Agreement:
     """offset_mm (h, w) by which the range would have to change, NaN where not judged;  jump_mm (h, w);  noise_mm: of the jump;  level_mm: above which a
-    place is named;  places: discs that fit into what is judged;  judged: its share of the valid cells;  spacing_mm, step: of the grid;  regions, the largest
-    jump first"""
+    place is named;  places: discs that fit into what is judged;  judged: its share of the valid cells;  spacing_mm, step: of the grid;  dents: whole dents, with
+    what of the scan is judged for them;  regions, the clearest first"""
 
     offset_mm: FloatArray
     jump_mm: FloatArray
@@ -52,6 +53,7 @@ class Agreement:
     judged: float
     spacing_mm: float
     step: int
+    dents: Dents
     regions: tuple[Region, ...]
 
 
@@ -59,49 +61,28 @@ def second_view(scan: RangeScan, picture: FloatArray, view: View, *, step: int =
     """The scan with its brightness against `picture` (h, w), any scale of light, taken by `view` under the same lamp.
 
     step: rows and columns averaged to one. Raises ScanError where the scan has no brightness or the two see nothing alike."""
-    from scipy.ndimage import gaussian_filter, map_coordinates
+    from scipy.ndimage import gaussian_filter
 
-    if picture.shape != (view.camera.height, view.camera.width):
-        raise ScanError(
-            f"{scan.name}: the second picture is {picture.shape[1]} x {picture.shape[0]}, its camera {view.camera.width} x {view.camera.height}; "
-            "give the camera of this picture"
-        )
-    grid = scan_grid(scan, step)
-    rows, columns = (np.flatnonzero(grid.valid.any(axis=axis)) for axis in (1, 0))
-    held = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
-    valid, sigma = grid.valid[held], WINDOW_MM / grid.spacing_mm
-    weight = valid.astype(float)
-    norm = gaussian_filter(weight, sigma)[valid]
+    pair = carried(scan, picture, view, step)
+    grid, valid, seen, own = pair.grid, pair.valid, pair.seen, pair.own
+    sigma = WINDOW_MM / grid.spacing_mm
+    norm = gaussian_filter(valid.astype(float), sigma)[valid]
 
     def mean(values: FloatArray) -> FloatArray:
-        spread = np.zeros(valid.shape)
-        spread[valid] = values
-        return np.asarray(gaussian_filter(spread, sigma)[valid] / norm)
+        return np.asarray(gaussian_filter(pair.spread(values), sigma)[valid] / norm)
 
-    points, rays = grid.points[grid.valid], grid.rays[grid.valid]
-    other = rigid.inverse(view.world_from_camera) @ scan.world_from_scan
-    at, _ = view.camera.project(rigid.move_points(other, points))
-    ahead, _ = view.camera.project(rigid.move_points(other, points + rays))
-    inside = (at >= 0) & (at <= np.array(picture.shape[::-1]) - 1.0)
-    seen: BoolArray = np.asarray((np.isfinite(ahead) & inside).all(axis=1))
-    at, along = np.where(seen[:, None], at, 0.0), np.where(seen[:, None], ahead - at, 0.0)
-    # as coarse as the grid's own cells, whose picture is the mean of step x step
-    light = gaussian_filter(picture.astype(float), 0.5 * step)
-    floor = max(1e-3 * float(light.max()), 1e-12)
-    own = np.log(np.maximum(np.nan_to_num(grid.picture[grid.valid]), 1e-3))
     own_mean = mean(own)
     own_spread = mean(own**2) - own_mean**2
     offsets = np.arange(-REACH_MM, REACH_MM + 0.5 * OFFSET_MM, OFFSET_MM)
-    match = np.empty((len(offsets), len(points)))
+    match = np.empty((len(offsets), len(own)))
     for k, offset in enumerate(offsets):
-        u, v = (at + offset * along).T
-        there = np.log(np.maximum(map_coordinates(light, [v, u], order=1, mode="nearest"), floor))
+        there = pair.there(float(offset))
         there_mean = mean(there)
         spread = own_spread * (mean(there**2) - there_mean**2)
         match[k] = (mean(own * there) - own_mean * there_mean) / np.sqrt(np.maximum(spread, 1e-18))
     best = match.argmax(axis=0)
     between = np.clip(best, 1, len(offsets) - 2)
-    cell = np.arange(len(points))
+    cell = np.arange(len(own))
     before, peak, after = (match[between + d, cell] for d in (-1, 0, 1))
     bend = before - 2.0 * peak + after
     believed = seen & (best == between) & (peak > _CORRELATED) & (bend < 0.0)
@@ -114,24 +95,31 @@ def second_view(scan: RangeScan, picture: FloatArray, view: View, *, step: int =
     offset_mm[grid.valid] = np.where(believed, found, np.nan)
     # windows at rims are one-sided
     offset_mm[~inner(grid.valid, 0.5 * sigma)] = np.nan
-    return _judged(grid.points, offset_mm, grid.valid, held, step, grid.spacing_mm)
+    return _judged(grid, offset_mm, pair.held, dents(pair))
 
 
-def _judged(
-    points: FloatArray, offset_mm: FloatArray, valid: BoolArray, held: tuple[slice, slice], step: int, spacing_mm: float
-) -> Agreement:
-    jump = np.full(valid.shape, np.nan)
-    jump[held] = jumps(offset_mm[held], DISC_MM / spacing_mm)
+def _judged(grid: ScanGrid, offset_mm: FloatArray, held: tuple[slice, slice], sunken: Dents) -> Agreement:
+    jump = np.full(grid.valid.shape, np.nan)
+    jump[held] = jumps(offset_mm[held], DISC_MM / grid.spacing_mm)
     known = np.isfinite(jump)
     count = int(known.sum())
-    places = max(1, round(count * spacing_mm**2 / (math.pi * DISC_MM**2)))
+    places = max(1, round(count * grid.spacing_mm**2 / (math.pi * DISC_MM**2)))
     noise = float(np.median(jump[known])) / _NORMAL_MAD if count else math.nan
     # the jump is the largest of several directions, each of either sign
     level = max(LEAST_MM, noise * NormalDist().inv_cdf(1.0 - CHANCE / (2.0 * _DIRECTIONS * places)))
     # a jump is as wide as its disc: less is the picture's grain
-    found = regions_of(np.nan_to_num(jump) > level, jump / noise, points, spacing_mm, 0.25 * math.pi * WINDOW_MM**2)
-    regions = tuple(sorted((region for region, _ in found), key=lambda region: -region.z))
-    return Agreement(offset_mm, jump, noise, level, places, count / max(1, int(valid.sum())), spacing_mm, step, regions)
+    least = 0.25 * math.pi * WINDOW_MM**2
+    stepped = regions_of(np.nan_to_num(jump) > level, jump / noise, grid.points, grid.spacing_mm, least)
+    whole = [replace(region, kind="shape") for region, _ in regions_of(sunken.named, sunken.z, grid.points, grid.spacing_mm, 0.0)]
+    # around a dent the range jumps, too
+    reaches = [(grid.points[region.cell], float(sunken.radius_mm[region.cell]) + DISC_MM) for region in whole]
+    alone = [
+        region for region, _ in stepped
+        if all(float(np.linalg.norm(grid.points[region.cell] - middle)) > reach for middle, reach in reaches)
+    ]  # fmt: skip
+    regions = tuple(sorted([*whole, *alone], key=lambda region: -region.z))
+    share = count / max(1, int(grid.valid.sum()))
+    return Agreement(offset_mm, jump, noise, level, places, share, grid.spacing_mm, grid.step, sunken, regions)
 
 
 def jumps(values: FloatArray, radius: float) -> FloatArray:
@@ -154,8 +142,3 @@ def jumps(values: FloatArray, radius: float) -> FloatArray:
             full &= count > _FILLED * half.sum()
         largest = np.fmax(largest, np.where(full, np.abs(means[0] - means[1]), np.nan))
     return largest
-
-
-def named_cells(agreement: Agreement) -> BoolArray:
-    """(h, w) cells above the level."""
-    return np.asarray(np.nan_to_num(agreement.jump_mm) > agreement.level_mm)
