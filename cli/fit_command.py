@@ -28,6 +28,23 @@ from .common import Point, common, settings_from
 @click.option(
     "--irradiance", type=click.FloatRange(1e-9), default=3.0, help="Of the lamps, so that a white surface shows irradiance/pi."
 )
+@click.option(
+    "--find",
+    multiple=True,
+    type=click.Choice(["pose", "exposure", "strength", "distance", "radius", "ambient"]),
+    help="Also find these; may be given several times. pose: the camera's, from --camera on, by small steps; exposure: of each picture but "
+    "the first; strength: irradiance of each lamp but the first; distance, radius: of each lamp; ambient: light from all around.",
+)
+@click.option(
+    "--lamp-distance", type=click.FloatRange(0, min_open=True), metavar="MM", help="The lamps' distance; far away otherwise."
+)
+@click.option(
+    "--lamp-radius",
+    type=click.FloatRange(0, 90, min_open=True, max_open=True),
+    default=0.25,
+    help="The lamps' angular radius, degrees.",
+)
+@click.option("--same-strength", is_flag=True, help="With --calibrate matt: the lamps are known to be of one strength.")
 @click.option("--spike", is_flag=True, help="Also fit a mirror's share; its highlight must be seen.")
 @click.option(
     "-o", "--output", "out", type=click.Path(), metavar="FILE", help="Material file (.toml); with --calibrate the list of lights."
@@ -45,6 +62,10 @@ def command(
     noise,
     scale,
     irradiance,
+    find,
+    lamp_distance,
+    lamp_radius,
+    same_strength,
     spike,
     out,
     unit,
@@ -63,5 +84,5 @@ def command(
     return fit(
         pictures, out, settings=settings_from(config, assignments), unit=unit, sphere=sphere, model=model, camera_mm=camera,
         field_deg=field, lights=lights, calibrate=calibrate, response=response, noise=noise, spike=spike, irradiance=irradiance, scale_mm=scale,
-        force=force, reporter=reporter,
+        find=find, lamp_distance_mm=lamp_distance, lamp_radius_deg=lamp_radius, same_strength=same_strength, force=force, reporter=reporter,
     )  # fmt: skip

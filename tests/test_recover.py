@@ -99,6 +99,16 @@ def test_the_pose_s_derivative_is_the_change_of_the_picture_where_the_same_trian
         assert np.abs(differences - mine).max() < 1e-5 * np.abs(mine).max()
 
 
+def test_one_camera_s_pose_moves_every_picture_as_its_own_pose_would():
+    sight = sphere_sight((20, 20), 17, (41, 41), 1.0)
+    light = Light(np.array([0.3, 0.5, 0.8]), 2.0, np.zeros(3), 200.0, 5.0)
+    one = problem_on(sight, (light,), Guess(), Unknowns((), direction=False, pose=True))
+    two = replace(one, photographs=one.photographs * 2, unknowns=replace(one.unknowns, one_camera=True))
+    assert [p.name for p in two.parameters()][:2] == ["camera turn x", "camera turn y"] and len(two.parameters()) == 6
+    for k in range(2):
+        assert np.array_equal(two.predict(two.start(), k).slopes, one.predict(one.start(), 0).slopes)
+
+
 def test_what_is_predicted_is_what_the_tracer_renders():
     surface = bumpy_ball()
     material = Material("satin", K_lm=0.3, K_sl=0.4, sigma_um=0.15, correlation_um=3.0, wavelengths_um=(0.555,), bounded=False)

@@ -150,3 +150,20 @@ def test_the_command_writes_a_material_with_its_uncertainty_that_other_commands_
     )
     assert degrees(np.loadtxt(tmp_path / "l.txt", skiprows=1), lamp) < 0.5
     assert exit_status(["fit", str(tmp_path / "ball.png"), "-o", str(tmp_path / "b.toml"), "-q"]) == 2
+
+
+def test_the_command_finds_what_it_is_asked_to_beside_the_material(tmp_path, capsys):
+    import json
+
+    import cv2
+
+    for k, exposure in enumerate((1.0, 0.8)):
+        picture = exposure * matt_picture(
+            np.array([0.4 - 0.6 * k, 0.3, 0.8]) / np.linalg.norm([0.4 - 0.6 * k, 0.3, 0.8]), 0.6, seed=k
+        )
+        cv2.imwrite(str(tmp_path / f"{k}.png"), np.clip(picture * 65535, 0, 65535).astype(np.uint16))
+    both = [str(tmp_path / "0.png"), str(tmp_path / "1.png"), "--sphere", "60,58,50"]
+    assert exit_status(["fit", *both, "--find", "exposure", "-o", str(tmp_path / "m.toml"), "--json"]) == 0
+    found = {e["name"]: e for e in json.loads(capsys.readouterr().out)["estimates"]}
+    assert found["picture 1 exposure"]["value"] == pytest.approx(0.8, rel=0.01)
+    assert exit_status(["fit", *both, "--find", "pose", "-o", str(tmp_path / "p.toml"), "-q"]) == 2

@@ -270,12 +270,13 @@ def _documents() -> dict[str, tuple[Any, ...]]:
         "fit": (
             "`fit` of a material to photographs",
             record(output=TEXT, estimates=many(fields_of(Estimate)), lights=many(POINT), not_determined=TEXTS, residual_in_noises=NUMBER,
-                   rms=NUMBER, outliers=NUMBER, converged=FLAG, inputs=NAMES, seconds=NUMBERS),
+                   rms=NUMBER, outliers=NUMBER, converged=FLAG, inputs=NAMES, seconds=NUMBERS, world_from_camera=or_null(POSE)),
         ),
         "lights": (
             "`fit --calibrate`",
             record(kind=one_of("chrome", "matt"), directions=many(POINT), inputs=NAMES, gains=maybe(many(NUMBER)), slope=maybe(NUMBER),
-                   paint=maybe(NUMBER), rms=maybe(NUMBER)),
+                   gloss=maybe(NUMBER), paint=maybe(NUMBER), rms=maybe(NUMBER), apart=maybe(many(NUMBER)), uneven=maybe(many(many(NUMBER))),
+                   closeness=maybe(many(NUMBER))),
         ),
         "explained": (
             "`fit` of a scan to its own brightness",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,25 +18,35 @@ from rangecheck.optics import PinholeCamera, Sensor
 from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.subject import hashes, read_subject
 from rangecheck.progress import Reporter
+from rangecheck.raycast import EmbreeCaster
 from rangecheck.recover.fit import Fitted
-from rangecheck.recover.lights import Light
+from rangecheck.recover.lights import ONE_NODE, SEVEN_NODES, Light
 from rangecheck.recover.problem import Guess, Photograph, Problem, Unknowns
 from rangecheck.recover.sight import Sight, lit_by, see, sphere_sight
+from rangecheck.reflectance import Material
+from rangecheck.scene import Scene
 
 #: cosines below which a pixel is left out: grazing views, where the model's bound and the shape's own errors count
 _LEAST_COSINE = 0.3
 _FAR = 1e4
+#: a distance that is looked for begins at this many sizes of the object;  looks at the surface anew while a pose is found
+_NEAR, _LOOKS = 5.0, 4
+#: a camera that moved less than this, as share of the object's size and rad, has settled
+_STILL = 1e-4
+_UNITS = {"radius": " degrees", "distance": " mm", "sigma_um": " um", "correlation_um": " um"}
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm")
 
 
 def fit(
     pictures: Sequence[str], out: str | None, *, settings: Any, unit: str | None, sphere: tuple[float, float, float] | None, model: str | None,
     camera_mm: tuple[float, ...] | None, field_deg: float, lights: str | None, calibrate: str | None, response: str, noise: float,
-    spike: bool, scale_mm: float | None, irradiance: float, force: bool, reporter: Reporter,
+    spike: bool, scale_mm: float | None, irradiance: float, force: bool, reporter: Reporter, find: Sequence[str] = (),
+    lamp_distance_mm: float | None = None, lamp_radius_deg: float = 0.25, same_strength: bool = False,
 ) -> Outcome:  # fmt: skip
     """Material and lamps from `pictures`, one lamp each, of a `sphere` (column, row, radius: parallel view) or a `model` seen from
     `camera_mm`; or, with neither, of a scan's brightness on its own surface, and where the two contradict each other.
-    `calibrate` (chrome or matt) finds the lamps of sphere pictures alone."""
+    `calibrate` (chrome or matt) finds the lamps of sphere pictures alone. `find`: what else is unknown, of pose, exposure, strength, distance, radius,
+    ambient; `lamp_distance_mm` and `lamp_radius_deg` are where the lamps' begin."""
     if sphere is None and model is None and len(pictures) == 1 and Path(pictures[0]).suffix.lower() not in _PICTURES:
         from rangecheck.pipeline.explained import fit_scan
 
@@ -49,65 +60,111 @@ def fit(
     if calibrate is not None:
         if sphere is None:
             raise SettingError("lamps are calibrated on a sphere; add --sphere COLUMN,ROW,RADIUS", key="calibrate")
-        return _calibrated(pictures, values, sphere, calibrate, out, force)
+        return _calibrated(pictures, values, sphere, calibrate, out, force, same_strength)
     if out is None:
         raise SettingError("name the material file: -o FILE.toml", key="out")
     given = None if lights is None else _directions(Path(lights), len(pictures))
     shape = (values[0].shape[0], values[0].shape[1])
+    if "pose" in find and sphere is not None:
+        raise SettingError("a sphere's outline is its pose; --find pose is for --on MESH", key="find")
+    look: _Look | None = None
     if sphere is not None:
-        sight, caster = sphere_sight(sphere[:2], sphere[2], shape), None
+        sight = _facing(sphere_sight(sphere[:2], sphere[2], shape))
     else:
-        sight, caster = _model_sight(str(model), shape, camera_mm, field_deg, settings, unit, reporter)
-    sight = sight.only((sight.normals * sight.views).sum(1) > _LEAST_COSINE)
-    middle = sight.points.mean(axis=0)
-    distance = _FAR * max(float(np.ptp(sight.points, axis=0).max()), 1e-6)
+        look = _look(str(model), shape, camera_mm, field_deg, settings, unit, reporter)
+        sight = _facing(look.see())
+    middle, size = sight.points.mean(axis=0), max(float(np.ptp(sight.points, axis=0).max()), 1e-6)
+    distance = lamp_distance_mm or size * (_NEAR if "distance" in find else _FAR)
     begun = given if given is not None else _first_directions(sight, values)
-    lamps = tuple(Light(d, irradiance, middle, distance, 0.25) for d in begun)
-    photos = []
-    for k, picture in enumerate(values):
-        seen = picture.reshape(-1)[sight.pixel]
-        lit = np.ones((len(sight), 1), bool) if caster is None else lit_by(sight, (lamps[k],), caster)
-        photos.append(Photograph(sight, seen, np.full(len(seen), noise), lit, (k,)))
+    lamps = tuple(Light(d, irradiance, middle, distance, lamp_radius_deg) for d in begun)
     names = (
         ("K_lm", "K_spike", "K_lobe", "sigma_um", "correlation_um") if spike else ("K_lm", "K_lobe", "sigma_um", "correlation_um")
     )
-    problem = Problem(tuple(photos), lamps, Guess(), Unknowns(names))
+    free = {"strength": "irradiance"}
+    unknowns = Unknowns(names, one_camera=True, **{free.get(name, name): True for name in find})
+    nodes = SEVEN_NODES if "radius" in find else ONE_NODE
+    problem = Problem(_photographs(sight, values, lamps, noise, look), lamps, Guess(), unknowns, nodes)
     from rangecheck.recover.fit import fit as solve
 
     with reporter.stage("fitting"):
         fitted = solve(problem, known_noise=False)
-    return _told(fitted, out, pictures, force, reporter)
+        if look is not None:
+            for _ in range(_LOOKS):
+                # what a pixel sees of the surface changes with the pose, shadows with the lamps
+                moved = look.moved(fitted)
+                state = fitted.problem
+                sight = _facing(look.see())
+                taken = _photographs(sight, values, state.lights, noise, look)
+                photos = tuple(replace(t, exposure=p.exposure, ambient=p.ambient) for t, p in zip(taken, state.photographs))
+                fitted = solve(
+                    replace(problem, photographs=photos, lights=state.lights, material=state.material), known_noise=False
+                )
+                if "pose" not in find or moved < _STILL * size:
+                    break
+            look.moved(fitted)
+    return _told(fitted, out, pictures, force, reporter, look, find)
 
 
-def _told(fitted: Fitted, out: str, pictures: Sequence[str], force: bool, reporter: Reporter) -> Outcome:
+def _facing(sight: Sight) -> Sight:
+    return sight.only((sight.normals * sight.views).sum(1) > _LEAST_COSINE)
+
+
+def _photographs(
+    sight: Sight, values: Sequence[FloatArray], lamps: Sequence[Light], noise: float, look: _Look | None
+) -> tuple[Photograph, ...]:
+    photos = []
+    for k, picture in enumerate(values):
+        seen = picture.reshape(-1)[sight.pixel]
+        lit = np.ones((len(sight), 1), bool) if look is None else lit_by(sight, (lamps[k],), look.caster)
+        photos.append(Photograph(sight, seen, np.full(len(seen), noise), lit, (k,)))
+    return tuple(photos)
+
+
+def _told(
+    fitted: Fitted, out: str, pictures: Sequence[str], force: bool, reporter: Reporter, look: _Look | None, find: Sequence[str]
+) -> Outcome:
     from rangecheck.recover.outcome import material_of, material_toml
 
     material = material_of(fitted, Path(out).stem)
     names = ", ".join(Path(p).name for p in pictures)
     write_bytes(out, material_toml(material, fitted, f"fitted to {names}").encode(), force=force)
     lines = [f"{out}: residuals are {fitted.scale:.2f} times the noise, {fitted.outliers:.1%} of the pixels are outliers"]
-    lines += [_line(e.name, e.value, e.low, e.high) for e in fitted.estimates if not e.name.startswith("light")]
+    lines += [
+        _line(e.name, e.value, e.low, e.high)
+        for e in fitted.estimates
+        if "direction" not in e.name and not e.name.startswith("camera")
+    ]
     lamps = [light.direction for light in fitted.problem.lights]
-    lines += [f"  light {k}: towards {_three(d)}" for k, d in enumerate(lamps)]
+    lines += [f"  light {k}: towards {_three(d)}{_within(fitted, k)}" for k, d in enumerate(lamps)]
+    pose = None if look is None or "pose" not in find else look.pose
+    if pose is not None:
+        lines.append(f"  camera: at {_three(pose[:3, 3], 2)} mm, looking along {_three(pose[:3, 2])}")
     lines += [f"not determined: {said}" for said in fitted.statements]
     if not fitted.converged:
         lines.append("the fit did not settle; give better guesses of the lights, or more pictures")
     content = document(
         "fit", output=out, estimates=[vars(e) for e in fitted.estimates], lights=lamps, not_determined=fitted.statements,
-        residual_in_noises=fitted.scale, rms=fitted.rms, outliers=fitted.outliers, converged=fitted.converged,
+        world_from_camera=pose, residual_in_noises=fitted.scale, rms=fitted.rms, outliers=fitted.outliers, converged=fitted.converged,
         inputs=hashes(list(pictures)), seconds=reporter.seconds,
     )  # fmt: skip
     return Outcome(content, lines)
 
 
 def _line(name: str, value: float, low: float | None, high: float | None) -> str:
-    return f"  {name:<16} {value:.4g}  " + (
+    return f"  {name:<18} {value:.4g}{_UNITS.get(name.split()[-1], '')}  " + (
         "not determined" if low is None or high is None else f"{low:.4g} to {high:.4g} (95 %)"
     )
 
 
-def _three(direction: FloatArray) -> str:
-    return ", ".join(f"{v:.4f}" for v in direction)
+def _within(fitted: Fitted, k: int) -> str:
+    """How well a lamp's direction is known, in words: the larger half width of its two intervals."""
+    pair = [e for e in fitted.estimates if e.name.startswith(f"light {k} direction")]
+    widths = [0.5 * (e.high - e.low) for e in pair if e.low is not None and e.high is not None]
+    return f", within {math.degrees(max(widths)):.2g} degrees (95 %)" if pair and len(widths) == len(pair) else ", not determined"
+
+
+def _three(vector: FloatArray, digits: int = 4) -> str:
+    return ", ".join(f"{v:.{digits}f}" for v in vector)
 
 
 def _linear(path: Path, response: str) -> FloatArray:
@@ -141,26 +198,50 @@ def _first_directions(sight: Sight, values: Sequence[FloatArray]) -> FloatArray:
     return np.array([f / max(float(np.linalg.norm(f)), 1e-12) for f in found])
 
 
-def _model_sight(
-    model: str, shape: tuple[int, int], camera_mm: tuple[float, ...] | None, field_deg: float, settings: Any, unit: str | None, reporter: Reporter
-) -> tuple[Sight, Any]:  # fmt: skip
-    from rangecheck.raycast import EmbreeCaster
-    from rangecheck.reflectance import Material
-    from rangecheck.scene import Scene
+@dataclass
+class _Look:
+    """A camera that looks at a surface: what it sees, from a pose that a fit may move."""
 
+    scene: Scene
+    caster: EmbreeCaster
+    camera: PinholeCamera
+    pose: FloatArray
+
+    def see(self) -> Sight:
+        return see(self.scene, self.camera, self.pose, self.caster)
+
+    def moved(self, fitted: Fitted) -> float:
+        """Move the pose by the turn and shift that a fit found; how far, mm, a point as far away as the camera's middle is moved at most."""
+        found = np.zeros(6)
+        for p, value in zip(fitted.parameters, fitted.theta):
+            if p.kind == "pose":
+                found[p.number] = value
+        angle = float(np.linalg.norm(found[:3]))
+        if angle > 0.0:
+            self.pose[:3, :3] = rigid.about_axis(found[:3] / angle, angle)[:3, :3] @ self.pose[:3, :3]
+        self.pose[:3, 3] += found[3:]
+        away = float(np.linalg.norm(self.pose[:3, 3] - self.scene.surface.bounds_mm.mean(axis=0)))
+        return angle * away + float(np.linalg.norm(found[3:]))
+
+
+def _look(
+    model: str, shape: tuple[int, int], camera_mm: tuple[float, ...] | None, field_deg: float, settings: Any, unit: str | None, reporter: Reporter
+) -> _Look:  # fmt: skip
     if camera_mm is None:
         raise SettingError("say where the camera stood: --camera X,Y,Z in mm; it looks at the middle of the object", key="camera")
     surface = read_subject(model, settings, unit, reporter).surface
     scene = Scene(surface, (Material("grey", K_lm=0.5, wavelengths_um=(0.555,)),), smooth=True)
-    caster = EmbreeCaster(surface.vertices, surface.faces)
     camera = PinholeCamera.from_field_of_view(shape[1], shape[0], field_deg)
-    return see(scene, camera, rigid.look_at(camera_mm, surface.bounds_mm.mean(axis=0)), caster), caster
+    pose = np.array(rigid.look_at(camera_mm, surface.bounds_mm.mean(axis=0)))
+    return _Look(scene, EmbreeCaster(surface.vertices, surface.faces), camera, pose)
 
 
 def _calibrated(
-    pictures: Sequence[str], values: list[FloatArray], sphere: tuple[float, float, float], kind: str, out: str | None, force: bool
-) -> Outcome:
+    pictures: Sequence[str], values: list[FloatArray], sphere: tuple[float, float, float], kind: str, out: str | None, force: bool,
+    same_strength: bool,
+) -> Outcome:  # fmt: skip
     from rangecheck.recover.matt import lights_from_matt
+    from rangecheck.recover.matt_ball import PAINTED
     from rangecheck.recover.spheres import Outline, light_from_chrome
 
     outline = Outline((sphere[0], sphere[1]), sphere[2])
@@ -169,13 +250,25 @@ def _calibrated(
     if kind == "chrome":
         directions = np.array([light_from_chrome(v, outline) for v in values])
     else:
-        found = lights_from_matt(values, outline)
+        found = lights_from_matt(values, outline, same_strength=same_strength)
         directions = found.directions
-        more = {"gains": found.gains, "slope": found.slope, "paint": found.spread, "rms": found.rms}
+        more = {"gains": found.gains, "slope": found.slope, "gloss": found.surface.gloss, "paint": found.spread, "rms": found.rms,
+                "apart": found.apart, "uneven": found.uneven, "closeness": found.closeness}  # fmt: skip
         lines.append(
             f"one matt surface of slope {math.degrees(math.atan(found.slope)):.1f} degrees, its albedo varying by {found.spread:.1%} from pixel to pixel; "
             f"residual {found.rms:.2%} of full scale"
         )
+        if len(values) < PAINTED:
+            lines.append(
+                f"{len(values)} of pictures do not tell stains and uneven beams from the lamp's direction; {PAINTED} or more would"
+            )
+        else:
+            worst = int(np.argmax(np.hypot(*found.uneven.T)))
+            lines.append(
+                f"the beams are not even across the ball: {_three(found.uneven[worst], 2)} to the right and up over a radius in {Path(pictures[worst]).name}, the most"
+            )
+        if same_strength:
+            lines.append(f"each picture alone would have its lamp's strength differ by at most {np.abs(found.apart).max():.2%}")
     text = "".join(f"{' '.join(f'{v:.6f}' for v in d)}\n" for d in directions)
     if out is not None:
         write_bytes(out, f"{len(directions)}\n{text}".encode(), force=force)

@@ -42,7 +42,7 @@ def material_toml(material: Material, fitted: Fitted, source: str) -> str:
         f"not_determined = [{', '.join(_text(said) for said in fitted.statements)}]",
     ]
     for e in fitted.estimates:
-        if not e.name.startswith(("light", "picture")):
+        if not e.name.startswith(("light", "picture", "camera")):
             lines.append(f"{e.name} = {_interval(e)}")
     return "\n".join(lines) + "\n"
 

@@ -28,6 +28,8 @@ LENGTHS = ("sigma_um", "correlation_um")
 #: a lobe weaker than this is none
 LEAST_LOBE = 1e-4
 _CHUNK = 8192
+#: owner of a parameter that serves all pictures
+_ALL = -1
 
 
 @dataclass(frozen=True)
@@ -89,8 +91,8 @@ class Photograph:
 class Unknowns:
     """What is to be found. `material` names strengths and lengths; the others say which of a light's or a picture's numbers are free.
 
-    Where both strengths and irradiance are free, or irradiance and exposure, only products act: `fit` says so. `same_strength`: one
-    irradiance for all lights."""
+    Where both strengths and irradiance are free, or irradiance and exposure, only products act: `fit` says so. `first_fixed`: irradiance of
+    the first light and exposure of the first picture are known. `one_camera`: one pose serves all pictures."""
 
     material: tuple[str, ...] = ("K_lm", "K_lobe", *LENGTHS)
     direction: bool = True
@@ -101,6 +103,7 @@ class Unknowns:
     ambient: bool = False
     pose: bool = False
     first_fixed: bool = True
+    one_camera: bool = False
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.material if name not in STRENGTHS + LENGTHS]
@@ -169,12 +172,13 @@ class Problem:
                 found.append(Parameter(f"picture {k} exposure", "exposure", k, 0, 1.0, -7.0, 7.0))
             if want.ambient:
                 found.append(Parameter(f"picture {k} ambient", "ambient", k, 0, 1.0, -1.0, 1.0))
-            if want.pose:
+            if want.pose and (k == 0 or not want.one_camera):
                 size = float(np.ptp(self.photographs[k].sight.points, axis=0).max())
                 for n in range(POSE_NUMBERS):
-                    name = f"picture {k} {'turn' if n < 3 else 'shift'} {'xyz'[n % 3]}"
+                    whose, owner = ("camera", _ALL) if want.one_camera else (f"picture {k}", k)
+                    name = f"{whose} {'turn' if n < 3 else 'shift'} {'xyz'[n % 3]}"
                     unit = 0.01 if n < 3 else 0.01 * size
-                    found.append(Parameter(name, "pose", k, n, unit, -inf, inf))
+                    found.append(Parameter(name, "pose", owner, n, unit, -inf, inf))
         return found
 
     def start(self) -> FloatArray:
@@ -211,7 +215,7 @@ class Problem:
             elif p.kind == "ambient":
                 photographs[p.owner] = replace(photographs[p.owner], ambient=value)
             else:
-                poses[p.owner, p.number] = value
+                poses[slice(None) if p.owner == _ALL else p.owner, p.number] = value
         turned = tuple(light.turned(a) for light, a in zip(lights, across))
         return replace(self, photographs=tuple(photographs), lights=turned, material=material), poses
 
@@ -320,7 +324,7 @@ class _Shown:
             elif p.kind == "log strength":
                 rows[:, column] = self.strengths[p.number] * (by_material[:, :, p.number] @ each)
             elif p.kind in ("exposure", "ambient", "pose"):
-                if p.owner != which:
+                if p.owner not in (which, _ALL):
                     continue
                 if p.kind == "exposure":
                     rows[:, column] = light
