@@ -117,6 +117,17 @@ def test_folds_as_narrow_as_cells_are_not_taken_for_paint():
     assert after**2 - exact**2 < 0.5**2 * (before**2 - exact**2)
 
 
+def test_hair_as_fine_as_cells_does_not_make_heights_worse_anywhere():
+    """What a cell's own slope tells the picture is not all that the grid knows of it: believed too much, one window was worse by 7 %."""
+    from rangecheck.studies.fit_refine import bust_picture, window_ratios
+
+    made, scan = bust_picture(100.0, 88600)
+    out = refine(scan)
+    before, after = (one.range_mm - made.true_range_mm for one in (scan, out.scan))
+    assert window_ratios(before, after).max() < 1.03
+    assert out.refined.sum() > 0.8 * scan.valid.sum()
+
+
 def test_a_slope_is_taken_on_the_own_surface_up_to_the_edge_before_another():
     """A ball before a wall: differences across its outline tilt by tens of degrees, those on one surface by what a cell's chord misses of the ball."""
     from rangecheck.raycast import Hits

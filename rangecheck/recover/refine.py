@@ -61,6 +61,8 @@ _DOUBTS, _DOUBT, _LOST = 6, 2.0, 8.0
 _DOUBT_SIGMAS, _DOUBT_ENERGY = 4.0, 2.2
 #: share of the brightness that lamp and albedo leave uncertain
 _LAMP = 0.01
+#: between the mean of a slope over a cell and that over two, where it walks at random by one step of the prior's a cell
+_MISSED = 1.0 / np.sqrt(24.0 * _LOOSER)
 _STEEPEST, _STEP_SIGMAS = 5.7, 4.0
 #: noise of slanted cells that is believed, in that of cells seen face on
 _SLANTED = 1.25
@@ -117,8 +119,9 @@ def refine(scan: RangeScan, *, fitted: Fitted | None = None, noise_mm: float | N
             "use the scan unrefined",
             name=scan.name, painted=float(painted.sum() / lit),
         )  # fmt: skip
-    # a lamp and an albedo are not known better than a few per cent
-    noise_seen = np.hypot(spread, _LAMP * shading.seen)
+    # a lamp and an albedo are not known better than a few per cent, a cell's own slope not better than its surface bends
+    known = np.hypot(np.hypot(spread, _LAMP * shading.seen), model.unseen(q, shading, albedo))
+    noise_seen = known
     for _ in range(_DOUBTS):
         q = model.with_picture(q, shading, believed, albedo, noise_seen)
         # where picture and range cannot both be right within their noise the picture is believed less: folds as narrow as cells, rims of paint
@@ -129,7 +132,7 @@ def refine(scan: RangeScan, *, fitted: Fitted | None = None, noise_mm: float | N
     else:
         believed, painted = believed & ~doubted, painted | doubted
         q = model.with_picture(q, shading, believed, albedo, noise_seen)
-    lost = believed & (noise_seen > _LOST * np.hypot(spread, _LAMP * shading.seen))
+    lost = believed & (noise_seen > _LOST * known)
     believed, painted = believed & ~lost, painted | lost
     return _done(scan, heights, q, heights.inner[believed], heights.inner[painted], noise, spread, fitted)
 
@@ -201,6 +204,18 @@ class _Model:
         odd = (np.abs(away) > sigmas) | (energy > most)
         near = maximum_filter(odd.astype(np.uint8), size=2 * round(_WINDOW) + 1)
         return np.asarray(near.reshape(-1)[self.heights.cell] > 0)
+
+    def unseen(self, q: FloatArray, shading: Shading, albedo: FloatArray) -> FloatArray:
+        """(m,) standard deviation of brightness that comes of bends within a cell, where the grid knows only the difference across it.
+
+        Bends of standard deviation s a cell are slopes that walk at random: their mean over a pixel, which the picture has, and that over the
+        two cells of a central difference are s / sqrt(24) apart. The prior's bends, found in steps of `_LOOSER`, are too large by its root in the middle."""
+        normals, slope_u, slope_v = self.heights.normals(q)
+        _, by_normal = shading.at(normals)
+        unit = np.zeros(len(q))
+        unit[self.heights.bend_cell] = self.bend_unit
+        missed = _MISSED * (self.curvature * unit)[self.heights.inner]
+        return np.asarray(albedo * missed * np.hypot((by_normal * slope_u).sum(1), (by_normal * slope_v).sum(1)))
 
     def with_picture(
         self, q: FloatArray, shading: Shading, believed: BoolArray, albedo: FloatArray, noise: FloatArray
