@@ -40,7 +40,8 @@ TIMEOUT_S = 120
 TOGETHER = 2
 #: the error of a program that was given a bound which it passed, and how programs end then, unless by a signal
 TOO_LITTLE = "needs more memory than memory_mb leaves for it; a higher memory_mb lets it answer"
-_STARVED = re.compile("bad_alloc|[Mm]emory|not map|map segment|pthread_create")  # the last: no room for a thread's stack
+#: no room for a thread's stack is told as pthread_create's failure, and Python 3.13 may fail to compile a module with no exception set
+_STARVED = re.compile("bad_alloc|[Mm]emory|not map|map segment|pthread_create|returned NULL without setting an exception")
 _NONE = np.empty(0, np.int64)
 
 
