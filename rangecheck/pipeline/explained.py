@@ -88,9 +88,9 @@ def _by_second_picture(path: str | Path, scan: RangeScan) -> tuple[dict[str, Any
     linear = replace(scan, brightness=sensor.linearise(scan.brightness).astype(np.float32))
     right = sensor.linearise(capture.right.white / capture.right.full_scale)
     found: Agreement = second_view(linear, right, capture.right_view, step=_step(scan, _SECOND_CELLS))
-    whole = ", ".join(f"{share:.0%} ({radius:g} mm)" for share, radius in zip(found.dents.judged, RADII_MM))
+    whole = ", ".join(f"{100 * share:.0f} % ({radius:g} mm)" for share, radius in zip(found.dents.judged, RADII_MM))
     said = [
-        f"{scan.name}: {found.judged:.0%} of it held against the second camera's picture, where steps of {found.level_mm:.2f} mm are named; elsewhere the "
+        f"{scan.name}: {100 * found.judged:.0f} % of it held against the second camera's picture, where steps of {found.level_mm:.2f} mm are named; elsewhere the "
         f"two pictures have too little in common; dents of {DENT_MM:g} mm would be named on {whole} of it, by radius",
         *_places(found.regions),
     ]
@@ -116,10 +116,10 @@ def _judged_line(name: str, found: Comparison) -> str:
     least = f"dents of {np.median(known):.2f} mm (median) would be named" if known.size else "nothing of it is lit well enough"
     if found.judged == 0.0:
         return (
-            f"{name}: its brightness differs by {found.paint:.1%} from the scan's shading in structures of a dent's size (paint, or noise of the ranges), so "
+            f"{name}: its brightness differs by {100 * found.paint:.1f} % from the scan's shading in structures of a dent's size (paint, or noise of the ranges), so "
             f"that only {least}: its shape cannot be judged to {JUDGED_MM:g} mm by it"
         )
-    return f"{name}: {found.judged:.0%} of it judged by its brightness to {JUDGED_MM:g} mm; {least}; elsewhere paint, shadow or grazing light hide the shape"
+    return f"{name}: {100 * found.judged:.0f} % of it judged by its brightness to {JUDGED_MM:g} mm; {least}; elsewhere paint, shadow or grazing light hide the shape"
 
 
 def _places(regions: Sequence[Region]) -> list[str]:

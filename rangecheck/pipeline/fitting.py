@@ -128,7 +128,7 @@ def _told(
     material = material_of(fitted, Path(out).stem)
     names = ", ".join(Path(p).name for p in pictures)
     write_bytes(out, material_toml(material, fitted, f"fitted to {names}").encode(), force=force)
-    lines = [f"{out}: residuals are {fitted.scale:.2f} times the noise, {fitted.outliers:.1%} of the pixels are outliers"]
+    lines = [f"{out}: residuals are {fitted.scale:.2f} times the noise, {100 * fitted.outliers:.1f} % of the pixels are outliers"]
     lines += [
         _line(e.name, e.value, e.low, e.high)
         for e in fitted.estimates
@@ -255,8 +255,8 @@ def _calibrated(
         more = {"gains": found.gains, "slope": found.slope, "gloss": found.surface.gloss, "paint": found.spread, "rms": found.rms,
                 "apart": found.apart, "uneven": found.uneven, "closeness": found.closeness}  # fmt: skip
         lines.append(
-            f"one matt surface of slope {math.degrees(math.atan(found.slope)):.1f} degrees, its albedo varying by {found.spread:.1%} from pixel to pixel; "
-            f"residual {found.rms:.2%} of full scale"
+            f"one matt surface of slope {math.degrees(math.atan(found.slope)):.1f} degrees, its albedo varying by {100 * found.spread:.1f} % from pixel to pixel; "
+            f"residual {100 * found.rms:.2f} % of full scale"
         )
         if len(values) < PAINTED:
             lines.append(
@@ -268,7 +268,9 @@ def _calibrated(
                 f"the beams are not even across the ball: {_three(found.uneven[worst], 2)} to the right and up over a radius in {Path(pictures[worst]).name}, the most"
             )
         if same_strength:
-            lines.append(f"each picture alone would have its lamp's strength differ by at most {np.abs(found.apart).max():.2%}")
+            lines.append(
+                f"each picture alone would have its lamp's strength differ by at most {100 * np.abs(found.apart).max():.2f} %"
+            )
     text = "".join(f"{' '.join(f'{v:.6f}' for v in d)}\n" for d in directions)
     if out is not None:
         write_bytes(out, f"{len(directions)}\n{text}".encode(), force=force)

@@ -48,7 +48,7 @@ def refined_scans(scans: list[RangeScan], reporter: Reporter) -> Shaped:
                     }
                 )
                 reporter.note(
-                    f"{scan.name}: {share:.0%} of the cells refined by their brightness, ranges moved by {moved:.3f} mm (rms)"
+                    f"{scan.name}: {100 * share:.0f} % of the cells refined by their brightness, ranges moved by {moved:.3f} mm (rms)"
                 )
             reporter.advance(number)
     return Shaped(found, done, facts)

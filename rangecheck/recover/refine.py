@@ -114,8 +114,8 @@ def refine(scan: RangeScan, *, fitted: Fitted | None = None, noise_mm: float | N
         raise ScanError(f"{scan.name}: no cell is lit well enough to be refined by its brightness", name=scan.name)
     if painted.sum() > MOST_PAINTED * lit:
         raise ScanError(
-            f"{scan.name}: on {painted.sum() / lit:.0%} of the well-lit cells the brightness differs from the shading of the scan's own shape by more than "
-            f"{_PAINT:.0%} over {_COARSE:g} cells: the albedo varies too much to tell paint from shape (at most {MOST_PAINTED:.0%} may); "
+            f"{scan.name}: on {100 * painted.sum() / lit:.0f} % of the well-lit cells the brightness differs from the shading of the scan's own shape by more than "
+            f"{100 * _PAINT:.0f} % over {_COARSE:g} cells: the albedo varies too much to tell paint from shape (at most {100 * MOST_PAINTED:.0f} % may); "
             "use the scan unrefined",
             name=scan.name, painted=float(painted.sum() / lit),
         )  # fmt: skip

@@ -115,11 +115,11 @@ def _coverage(quick: bool) -> tuple[list[Any], list[str], list[dict[str, Any]]]:
     names = list(dict.fromkeys(row["parameter"] for row in rows))
     per = {n: [bool(r["inside"]) for r in stated_rows if r["parameter"] == n] for n in names}
     findings = [
-        f"{scenes} random scenes of {size} x {size} pixels, noise {NOISE:.0%}: the truth lies inside the stated 95 % interval in "
-        f"{share:.1%} of {len(stated_rows)} stated numbers",
-        *(f"  {n}: {np.mean(v):.1%} of {len(v)}" for n, v in per.items() if v),
+        f"{scenes} random scenes of {size} x {size} pixels, noise {100 * NOISE:.0f} %: the truth lies inside the stated 95 % interval in "
+        f"{100 * share:.1f} % of {len(stated_rows)} stated numbers",
+        *(f"  {n}: {100 * np.mean(v):.1f} % of {len(v)}" for n, v in per.items() if v),
         f"{len(rows) - len(stated_rows)} of {len(rows)} numbers were said not to be determined; "
-        f"{sum(r['converged'] for r in rows) / len(rows):.1%} of the fits converged",
+        f"{100 * (sum(r['converged'] for r in rows) / len(rows)):.1f} % of the fits converged",
     ]
     chart = LineChart(
         "coverage",
@@ -222,7 +222,7 @@ def _noise(quick: bool) -> tuple[list[Any], list[str], list[dict[str, Any]]]:
 
 
 def _percents(values: Any) -> str:
-    return ", ".join("not determined" if math.isnan(v) else f"{v:.2%}" for v in values)
+    return ", ".join("not determined" if math.isnan(v) else f"{100 * v:.2f} %" for v in values)
 
 
 def _limits(quick: bool) -> tuple[list[Any], list[str], list[dict[str, Any]]]:

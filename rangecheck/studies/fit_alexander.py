@@ -112,7 +112,7 @@ def shading_explained(scan: RangeScan) -> tuple[Fitted, FloatArray, dict[str, fl
 
 
 def _shares(found: Dents) -> str:
-    return ", ".join(f"{share:.0%} (radius {radius:g} mm)" for share, radius in zip(found.judged, RADII_MM))
+    return ", ".join(f"{100 * share:.0f} % (radius {radius:g} mm)" for share, radius in zip(found.judged, RADII_MM))
 
 
 def _dents_named(
@@ -162,11 +162,11 @@ def alexander(quick: bool) -> tuple[list[Any], list[str], list[dict[str, Any]], 
     findings = [
         f"left picture: lamp towards {towards} (scan's frame), {light.distance_mm:.3g} mm away, K_lm {fitted.problem.material.K_lm:.3f}, K_lobe "
         f"{fitted.problem.material.K_lobe:.3f}",
-        f"in structures of a dent's size the picture varies by {spreads['picture']:.1%}, the fitted shading by {spreads['shading']:.1%}, what is left by "
-        f"{spreads['left']:.1%}: paint hides shape from shading alone",
-        f"by shading {shaded.judged:.0%} of the scan could be judged to 1 mm: there dents of {np.median(shown) if shown.size else math.nan:.2f} mm (median) "
+        f"in structures of a dent's size the picture varies by {100 * spreads['picture']:.1f} %, the fitted shading by {100 * spreads['shading']:.1f} %, what is left by "
+        f"{100 * spreads['left']:.1f} %: paint hides shape from shading alone",
+        f"by shading {100 * shaded.judged:.0f} % of the scan could be judged to 1 mm: there dents of {np.median(shown) if shown.size else math.nan:.2f} mm (median) "
         f"would be named, from {shaded.level:.1f} sigma; {len(shaded.regions)} places named",
-        f"second view: {clean.judged:.0%} of the scan judged, noise of a jump {clean.noise_mm:.3f} mm, named from {clean.level_mm:.3f} mm",
+        f"second view: {100 * clean.judged:.0f} % of the scan judged, noise of a jump {clean.noise_mm:.3f} mm, named from {clean.level_mm:.3f} mm",
         f"dents of {JUDGED_MM:g} mm: {_shares(clean.dents)} of the scan judged; amounts of {clean.dents.spread_mm:.3f} mm (one deviation) are found everywhere, z "
         f"is named from {clean.dents.level:.2f}, the largest of the unaltered scan is {np.nanmax(clean.dents.z):.2f}",
         f"unaltered scan: {len(clean.regions)} places named of {clean.places} discs of {DISC_MM:g} mm radius judged for steps and of "

@@ -134,11 +134,11 @@ def refinement(quick: bool) -> tuple[list[Any], list[str], list[dict[str, Any]]]
         numbers, without = judged(made, scan, refined, joined), judged(made, scan, alone, joined)
         rows.append(row | numbers | {"without_picture_deg": without["surface_after_deg"]})
         findings += [
-            f"{name}: slope error on the own surface {_told(numbers, 'own')}, of the {numbers['own_cells'] / scan.valid.sum():.0%} between four that returned; "
-            f"of {numbers['rims_cells'] / scan.valid.sum():.0%}, rims and all, {_told(numbers, 'rims')}",
+            f"{name}: slope error on the own surface {_told(numbers, 'own')}, of the {100 * numbers['own_cells'] / scan.valid.sum():.0f} % between four that returned; "
+            f"of {100 * numbers['rims_cells'] / scan.valid.sum():.0f} %, rims and all, {_told(numbers, 'rims')}",
             f"  central differences: of cells on one surface with their neighbours {_told(numbers, 'surface')}, without the picture times "
             f"{without['surface_after_deg'] / numbers['surface_before_deg']:.3f}; of all cells, steps and all, {_told(numbers, 'all')}; of the "
-            f"{numbers['cells'] / scan.valid.sum():.0%} that the picture refined {_told(numbers, 'refined')}",
+            f"{100 * numbers['cells'] / scan.valid.sum():.0f} % that the picture refined {_told(numbers, 'refined')}",
             f"  heights {numbers['height_before_mm']:.4f} to {numbers['height_after_mm']:.4f} mm rms; of {numbers['windows']} windows "
             f"{numbers['windows_worse']} are worse by more than 5 %, the worst is times {numbers['worst_window']:.3f}, the middle one "
             f"{numbers['middle_window']:.3f}",
