@@ -6,12 +6,13 @@ from test_meshing_fuse import CAMERA, ROUND, scan_of, scans_around
 
 from rangecheck import rigid
 from rangecheck.analytic.shapes import Sphere
-from rangecheck.errors import ScanError, SettingError
+from rangecheck.errors import DependencyMissing, ScanError, SettingError, SurfaceError
 from rangecheck.optics import RayGrid
 from rangecheck.scan import RangeScan
 from rangecheck.scan.point_cloud import PointCloud
 from rangecheck.surface import INTERPOLATED, INVENTED, MEASURED, Surface
-from rangecheck.surface.meshing import choose_method, fuse, mesh_scans, pivot, poisson
+from rangecheck.surface.meshing import choose_method, engine_tasks, fuse, mesh_scans, pivot, poisson
+from rangecheck.surface.meshing.engines import Engine
 from rangecheck.surface.meshing.openings import opened, patch_extents
 from rangecheck.surface.meshing.oriented import oriented_points
 from rangecheck.surface.topology import boundary_edges, non_manifold_edges, non_manifold_vertices
@@ -57,11 +58,12 @@ def test_pivoting_joins_samples_and_leaves_a_manifold():
 @pytest.mark.engines
 def test_normals_look_at_the_scanner_and_lonely_samples_get_none():
     scan = scan_of(Sphere(50.0), rigid.look_at((0.0, 0.0, 300.0), (0.0, 0.0, 0.0)))
-    points, normals = oriented_points([scan])
+    with Engine("open3d") as open3d:
+        points, normals = oriented_points([scan], open3d)
     assert ((normals * points).sum(axis=1) > 0).all()
     line = PointCloud(np.stack([np.linspace(0, 1, 40), np.zeros(40), np.zeros(40)], axis=1), name="wire")
-    with pytest.raises(ScanError, match="span a plane"):
-        oriented_points([line])
+    with Engine("open3d") as open3d, pytest.raises(ScanError, match="span a plane"):
+        oriented_points([line], open3d)
 
 
 @pytest.mark.engines
@@ -126,3 +128,50 @@ def test_nothing_is_refused_with_the_reason_by_every_method(method):
         method([])
     with pytest.raises(ScanError, match="samples"):
         method([PointCloud(np.zeros((5, 3)))])
+
+
+#: an engine that ends by SIGSEGV over its first `crashes` questions, counted in a file beside it
+CRASHES = """
+import os, runpy, signal, sys
+from pathlib import Path
+count = Path(__file__).with_suffix(".count")
+done = int(count.read_text()) if count.exists() else 0
+count.write_text(str(done + 1))
+if done < {crashes}:
+    sys.stdin.readline()
+    os.kill(os.getpid(), signal.SIGSEGV)
+runpy.run_path({tasks!r}, run_name="__main__")
+"""
+
+
+def crashing(times: int, folder, monkeypatch) -> None:
+    script = folder / "crashing.py"
+    script.write_text(CRASHES.format(crashes=times, tasks=engine_tasks.__file__))
+    monkeypatch.setattr(engine_tasks, "__file__", str(script))
+
+
+@pytest.mark.engines
+def test_an_engine_that_crashes_once_is_asked_again_and_answers_the_same(tmp_path, monkeypatch):
+    points = np.random.default_rng(1).normal(size=(200, 3))
+    with Engine("open3d") as open3d:
+        undisturbed = open3d.ask("covariances", points=points, neighbours=8)["covariances"]
+    crashing(1, tmp_path, monkeypatch)
+    with Engine("open3d") as open3d:
+        assert open3d.ask("covariances", points=points, neighbours=8)["covariances"].tobytes() == undisturbed.tobytes()
+        assert open3d.ask("covariances", points=points, neighbours=8)["covariances"].tobytes() == undisturbed.tobytes()
+
+
+def test_an_engine_that_always_crashes_is_an_error_that_names_the_signal_and_the_way_round_it(tmp_path, monkeypatch):
+    crashing(9, tmp_path, monkeypatch)
+    with Engine("open3d") as open3d, pytest.raises(SurfaceError, match=r"open3d ended 2 times .* SIGSEGV; .*pymeshlab"):
+        open3d.ask("covariances", points=np.eye(3), neighbours=2)
+
+
+def test_an_absent_engine_is_named_with_the_line_that_mends_it(tmp_path, monkeypatch):
+    script = tmp_path / "absent.py"
+    script.write_text(
+        f"import runpy, sys\nsys.modules['open3d'] = None\nrunpy.run_path({engine_tasks.__file__!r}, run_name='__main__')\n"
+    )
+    monkeypatch.setattr(engine_tasks, "__file__", str(script))
+    with Engine("open3d") as open3d, pytest.raises(DependencyMissing, match=r"open3d .*pip install"):
+        open3d.ask("covariances", points=np.eye(3), neighbours=2)

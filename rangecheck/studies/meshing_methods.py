@@ -6,12 +6,14 @@ must not take the study with it (open3d's Poisson on all threads does so now and
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from multiprocessing import get_context
+from typing import Any
 
 import numpy as np
 
@@ -19,34 +21,33 @@ from rangecheck.arrays import FloatArray, IntArray
 from rangecheck.scan import RangeScan
 from rangecheck.study import Timed
 from rangecheck.surface.meshing import fuse, pivot
-from rangecheck.surface.meshing.oriented import open3d, oriented_points
+from rangecheck.surface.meshing.engine_tasks import TASKS
+from rangecheck.surface.meshing.oriented import oriented_points
 from rangecheck.surface.meshing.poisson import BOX_SCALE
 from rangecheck.surface.surface import Surface
 
 
+class _Here:
+    """Engines in this process, which is one of their own already, and where what is timed is they alone."""
+
+    def ask(self, task: str, **given: Any) -> dict[str, Any]:
+        return TASKS[task](**given)
+
+
 def open3d_poisson(scans: Sequence[RangeScan], depth: int) -> Surface:
     """open3d's screened Poisson on all threads, its normals included."""
-    engine = open3d()
-    points, normals = oriented_points(scans)
-    cloud = engine.geometry.PointCloud(engine.utility.Vector3dVector(points))
-    cloud.normals = engine.utility.Vector3dVector(normals)
-    with engine.utility.VerbosityContextManager(engine.utility.VerbosityLevel.Error):
-        mesh, _ = engine.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, scale=BOX_SCALE, n_threads=-1)
-    return _surface(np.asarray(mesh.vertices), np.asarray(mesh.triangles))
+    return _poisson("poisson_open3d", scans, depth, threads=-1)
 
 
 def meshlab_poisson(scans: Sequence[RangeScan], depth: int) -> Surface:
     """MeshLab's screened Poisson on all threads, the normals included."""
-    import os
+    return _poisson("poisson_meshlab", scans, depth, threads=os.cpu_count() or 1)
 
-    import pymeshlab
 
-    points, normals = oriented_points(scans)
-    meshes = pymeshlab.MeshSet(verbose=False)
-    meshes.add_mesh(pymeshlab.Mesh(vertex_matrix=points, v_normals_matrix=normals))
-    meshes.generate_surface_reconstruction_screened_poisson(depth=depth, scale=BOX_SCALE, threads=os.cpu_count() or 1)
-    made = meshes.current_mesh()
-    return _surface(made.vertex_matrix(), made.face_matrix())
+def _poisson(task: str, scans: Sequence[RangeScan], depth: int, threads: int) -> Surface:
+    points, normals = oriented_points(scans, _Here())
+    made = TASKS[task](points, normals, depth, BOX_SCALE, threads)
+    return _surface(made["vertices"], made["faces"])
 
 
 def _surface(vertices: FloatArray, faces: IntArray) -> Surface:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from types import ModuleType
 
 import numpy as np
 
 from rangecheck import rigid
 from rangecheck.arrays import FloatArray
-from rangecheck.errors import DependencyMissing, ScanError
+from rangecheck.errors import ScanError
 from rangecheck.scan import RangeScan
 from rangecheck.scan.point_cloud import PointCloud
+from rangecheck.surface.meshing.engines import Asked
 
 #: neighbours through which a normal's plane is laid
 NEIGHBOURS = 24
@@ -19,26 +19,14 @@ NEIGHBOURS = 24
 FLATTEST = 1e-4
 
 
-def open3d() -> ModuleType:
-    """The open3d package, imported where it is needed: it takes a second, and system libraries. Raises DependencyMissing."""
-    try:
-        import open3d
-    except (ImportError, OSError) as error:
-        raise DependencyMissing(
-            f"open3d ({error})", "Poisson meshing and ball pivoting", "pip install 'rangecheck[engines]'"
-        ) from None
-    return open3d
-
-
-def oriented_points(scans: Sequence[RangeScan | PointCloud]) -> tuple[FloatArray, FloatArray]:
-    """All samples (n, 3) mm and unit normals (n, 3), turned towards the scanner that saw each.
+def oriented_points(scans: Sequence[RangeScan | PointCloud], open3d: Asked) -> tuple[FloatArray, FloatArray]:
+    """All samples (n, 3) mm and unit normals (n, 3), turned towards the scanner that saw each; open3d finds the neighbours.
 
     Normals are those of the plane through the NEIGHBOURS nearest samples of all scans. A cloud's own normals are kept; without any
     they are made consistent from point to point, outward at the outermost. Samples whose neighbours lie on a line have no normal
     and are left out (the engine would give them (0, 0, 1), silently). Raises ScanError when under 16 remain."""
     if not scans:
         raise ScanError("there are no scans; a surface needs at least one")
-    engine = open3d()
     points = np.concatenate([s.points_mm if isinstance(s, PointCloud) else s.points_mm() for s in scans])
     if len(points) < 16:
         raise ScanError(
@@ -46,9 +34,8 @@ def oriented_points(scans: Sequence[RangeScan | PointCloud]) -> tuple[FloatArray
             valid=len(points),
         )
     shift = points.mean(axis=0)
-    cloud = engine.geometry.PointCloud(engine.utility.Vector3dVector(points - shift))
-    cloud.estimate_covariances(engine.geometry.KDTreeSearchParamKNN(min(NEIGHBOURS, len(points) - 1)))
-    values, vectors = np.linalg.eigh(np.asarray(cloud.covariances))
+    near = open3d.ask("covariances", points=points - shift, neighbours=min(NEIGHBOURS, len(points) - 1))
+    values, vectors = np.linalg.eigh(near["covariances"])
     normals = np.ascontiguousarray(vectors[:, :, 0])
     spread = values[:, 1] > FLATTEST * np.maximum(values[:, 2], np.finfo(float).tiny)
     start = 0
@@ -63,7 +50,7 @@ def oriented_points(scans: Sequence[RangeScan | PointCloud]) -> tuple[FloatArray
             normals[part], spread[part] = scan.normals, True
         else:
             flat = np.flatnonzero(spread[part]) + start
-            normals[flat] = _consistent(engine, points[flat], normals[flat])
+            normals[flat] = _consistent(open3d, points[flat], normals[flat])
         start += count
     if spread.sum() < 16:
         raise ScanError(
@@ -79,15 +66,13 @@ def _named(scans: Sequence[RangeScan | PointCloud]) -> str:
     return f"{', '.join(names[:3])}{more}:"
 
 
-def _consistent(engine: ModuleType, points: FloatArray, normals: FloatArray) -> FloatArray:
+def _consistent(open3d: Asked, points: FloatArray, normals: FloatArray) -> FloatArray:
     if len(points) < 16:
         return normals
     # the engine's Delaunay step refuses points in one plane or on one sphere: moved by a millionth of the extent they are not
     jitter = np.random.default_rng(0).uniform(-1e-6, 1e-6, points.shape) * float(np.ptp(points, axis=0).max())
-    cloud = engine.geometry.PointCloud(engine.utility.Vector3dVector(points + jitter))
-    cloud.normals = engine.utility.Vector3dVector(normals)
-    cloud.orient_normals_consistent_tangent_plane(min(NEIGHBOURS, len(points) - 1))
-    turned = np.asarray(cloud.normals).copy()
+    neighbours = min(NEIGHBOURS, len(points) - 1)
+    turned = np.asarray(open3d.ask("turned", points=points + jitter, normals=normals, neighbours=neighbours)["normals"])
     outermost = int(np.argmax(((points - points.mean(axis=0)) ** 2).sum(axis=1)))
     outward = points[outermost] - points.mean(axis=0)
     return turned if turned[outermost] @ outward >= 0 else -turned

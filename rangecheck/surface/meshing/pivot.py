@@ -13,9 +13,10 @@ import numpy as np
 from rangecheck.errors import SettingError, SurfaceError
 from rangecheck.scan import RangeScan
 from rangecheck.scan.point_cloud import PointCloud
+from rangecheck.surface.meshing.engines import Engine
 from rangecheck.surface.meshing.labels import labelled, thresholds
 from rangecheck.surface.meshing.openings import opened
-from rangecheck.surface.meshing.oriented import nearest_spacing, open3d, oriented_points, spacing_of
+from rangecheck.surface.meshing.oriented import nearest_spacing, oriented_points, spacing_of
 from rangecheck.surface.surface import Surface
 from rangecheck.surface.topology import non_manifold_edges, non_manifold_vertices
 
@@ -38,22 +39,17 @@ def pivot(
     The other arguments are those of `fuse`; a ball never spans more than it is wide, so little is ever invented.
 
     Raises ScanError for too few samples, SurfaceError when no ball rests on three, DependencyMissing without open3d."""
-    points, normals = oriented_points(scans)
-    spacing = spacing_of(scans)
-    cell = voxel_mm or spacing
-    if not (np.isfinite(cell) and cell > 0):
+    if not (voxel_mm is None or (np.isfinite(voxel_mm) and voxel_mm > 0)):
         raise SettingError(f"voxel_mm is {voxel_mm}; it must be a positive number of millimetres", key="voxel_mm")
+    with Engine("open3d") as open3d:
+        points, normals = oriented_points(scans, open3d)
+        spacing = spacing_of(scans)
+        cell, shift = voxel_mm or spacing, points.mean(axis=0)
+        few = open3d.ask("thinned", points=points - shift, normals=normals, cell=cell)
+        radii = np.array(RADII) * max(nearest_spacing(few["points"]), cell)
+        made = open3d.ask("pivoted", **few, radii=radii)
     measured, interpolated = thresholds(spacing, measured_mm, interpolated_mm)
-    engine = open3d()
-    shift = points.mean(axis=0)
-    cloud = engine.geometry.PointCloud(engine.utility.Vector3dVector(points - shift))
-    cloud.normals = engine.utility.Vector3dVector(normals)
-    cloud = cloud.voxel_down_sample(cell)
-    cloud.normalize_normals()
-    thinned = nearest_spacing(np.asarray(cloud.points))
-    radii = engine.utility.DoubleVector([r * max(thinned, cell) for r in RADII])
-    mesh = engine.geometry.TriangleMesh.create_from_point_cloud_ball_pivoting(cloud, radii)
-    vertices, faces = np.asarray(mesh.vertices) + shift, np.asarray(mesh.triangles).astype(np.int32)
+    vertices, faces = made["vertices"] + shift, made["faces"]
     if len(faces) == 0:
         raise SurfaceError(f"no ball of {max(radii):.3g} mm rests on three samples; raise voxel_mm, or use poisson")
     surface = Surface(vertices, faces).with_faces(np.arange(len(faces)))

@@ -14,13 +14,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rangecheck.arrays import FloatArray, IntArray
-from rangecheck.errors import DependencyMissing, SettingError, SurfaceError
+from rangecheck.arrays import FloatArray
+from rangecheck.errors import SettingError, SurfaceError
 from rangecheck.scan import RangeScan
 from rangecheck.scan.point_cloud import PointCloud
+from rangecheck.surface.meshing.engines import Engine
 from rangecheck.surface.meshing.labels import labelled, thresholds
 from rangecheck.surface.meshing.openings import opened
-from rangecheck.surface.meshing.oriented import open3d, oriented_points, spacing_of
+from rangecheck.surface.meshing.oriented import oriented_points, spacing_of
 from rangecheck.surface.surface import Surface
 
 #: side of the engine's box in extents of the samples, and the range of octree depths that is used
@@ -53,7 +54,8 @@ def poisson(
     Raises ScanError for too few samples, SettingError for bad settings, DependencyMissing without the engine."""
     if engine not in ("open3d", "pymeshlab"):
         raise SettingError(f"engine is {engine!r}; it must be open3d or pymeshlab", key="engine")
-    points, normals = oriented_points(scans)
+    with Engine("open3d") as open3d:
+        points, normals = oriented_points(scans, open3d)
     spacing = spacing_of(scans)
     step = voxel_mm or 1.5 * spacing
     if not (math.isfinite(step) and step > 0):
@@ -63,34 +65,12 @@ def poisson(
         raise SettingError(f"depth is {depth}; it must be 1 to 14", key="depth")
     measured, interpolated = thresholds(spacing, measured_mm, interpolated_mm)
     shift = points.mean(axis=0)
-    solve = _by_open3d if engine == "open3d" else _by_meshlab
-    vertices, faces = solve(points - shift, normals, level)
+    with Engine(engine) as solver:
+        task = "poisson_open3d" if engine == "open3d" else "poisson_meshlab"
+        made = solver.ask(task, points=points - shift, normals=normals, depth=level, scale=BOX_SCALE)
+    vertices, faces = made["vertices"], made["faces"]
     if len(faces) == 0:
         raise SurfaceError("Poisson reconstruction found no surface; check the scans' poses, or use fuse")
     surface = Surface(vertices + shift, faces).with_faces(np.arange(len(faces)))
     cell = BOX_SCALE * float(np.ptp(points, axis=0).max()) / 2**level
     return opened(labelled(surface, scans, cell, measured, interpolated), closing, largest_hole_mm)
-
-
-def _by_open3d(points: FloatArray, normals: FloatArray, depth: int) -> tuple[FloatArray, IntArray]:
-    engine = open3d()
-    cloud = engine.geometry.PointCloud(engine.utility.Vector3dVector(points))
-    cloud.normals = engine.utility.Vector3dVector(normals)
-    with engine.utility.VerbosityContextManager(engine.utility.VerbosityLevel.Error):
-        mesh, _ = engine.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, scale=BOX_SCALE, n_threads=1)
-    mesh.remove_degenerate_triangles()
-    return np.asarray(mesh.vertices).copy(), np.asarray(mesh.triangles).astype(np.int32)
-
-
-def _by_meshlab(points: FloatArray, normals: FloatArray, depth: int) -> tuple[FloatArray, IntArray]:
-    try:
-        import pymeshlab
-    except (ImportError, OSError) as error:
-        raise DependencyMissing(
-            f"pymeshlab ({error})", "MeshLab's Poisson meshing", "pip install 'rangecheck[engines]'"
-        ) from None
-    meshes = pymeshlab.MeshSet(verbose=False)
-    meshes.add_mesh(pymeshlab.Mesh(vertex_matrix=points, v_normals_matrix=normals))
-    meshes.generate_surface_reconstruction_screened_poisson(depth=depth, scale=BOX_SCALE, threads=1)
-    mesh = meshes.current_mesh()
-    return mesh.vertex_matrix(), mesh.face_matrix().astype(np.int32)
