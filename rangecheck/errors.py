@@ -20,6 +20,10 @@ class RangecheckError(Exception):
         for name, value in measured.items():
             setattr(self, name, value)
 
+    def __str__(self) -> str:
+        """One line that no name in a file can break or colour: what is not printable is written as Python would escape it."""
+        return "".join(c if c.isprintable() else repr(c)[1:-1] for c in super().__str__())
+
 
 class InputError(RangecheckError):
     """A file or folder cannot be read, or does not hold what it says. `path` names it."""

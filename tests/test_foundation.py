@@ -30,6 +30,11 @@ def test_an_error_keeps_what_it_measured():
     assert error.measured == {"edges": 3}
 
 
+def test_an_error_is_one_line_whatever_a_file_calls_its_parts():
+    told = str(errors.SettingError("camera.a\nb\x1b[31m\u2028\udcff is unknown; müssen"))
+    assert told == r"camera.a\nb\x1b[31m\u2028\udcff is unknown; müssen"
+
+
 def test_a_wrong_array_is_refused_by_its_name():
     with pytest.raises(errors.ArrayError, match=r"points_mm has shape \(2, 2\); it must be \(n, 3\)"):
         arrays.require("points_mm", [[1, 2], [3, 4]], (None, 3))

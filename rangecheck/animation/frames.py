@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -201,7 +202,7 @@ def _taken_up(where: Path, job: str, frames: int, suffix: str, force: bool) -> d
         with suppress(InputError):
             manifest = read_json(where / MANIFEST)
     if _is_ours(manifest, fresh):
-        return manifest
+        return fresh | {"exposure": manifest["exposure"], "done": manifest["done"]}
     if (present or manifest is not None) and not force:
         other = manifest.get("key") if isinstance(manifest, dict) else None
         whose = f"frames of another job (key {str(other)[:12]}, this one is {job[:12]})" if other else "frames of an unknown job"
@@ -219,5 +220,7 @@ def _is_ours(manifest: Any, fresh: dict[str, Any]) -> bool:
         isinstance(manifest, dict)
         and all(manifest.get(name) == fresh[name] for name in ("schema", "key", "frames", "suffix"))
         and isinstance(manifest.get("done"), dict)
-        and (manifest.get("exposure") is None or (isinstance(manifest["exposure"], float) and manifest["exposure"] > 0))
+        and all(isinstance(digest, str) for digest in manifest["done"].values())
+        and "exposure" in manifest
+        and (manifest["exposure"] is None or (isinstance(manifest["exposure"], float) and 0 < manifest["exposure"] < math.inf))
     )

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from fuzz.mutate import CAMERA, mutated
+from rangecheck.animation.frames import render_frames
 from rangecheck.config import load_settings
 from rangecheck.dataset.index import read_index
 from rangecheck.dataset.ranges import read_ranges
@@ -24,9 +25,13 @@ from rangecheck.export.pictures import read_map_png16, read_png
 from rangecheck.files import presets_folder
 from rangecheck.modeler import read_model
 from rangecheck.pipeline.fitting import _directions
+from rangecheck.pipeline.folder import job_folder
 from rangecheck.pipeline.page import _charts
 from rangecheck.reflectance import load_material
+from rangecheck.scan import RangeScan
 from rangecheck.scan.decode.capture import read_capture
+from rangecheck.scan.readers import write_scans
+from rangecheck.scan.readers.manifest import read_manifest
 from rangecheck.solid.printer import printer
 from rangecheck.studies.scenes import ball
 from rangecheck.surface.mesh_files import read_mesh
@@ -122,13 +127,39 @@ def documents(folder: Path) -> list[Entry]:
     chart = {"slug": "a", "title": "A"}
     study = {"schema": "rangecheck/study/1", "name": "x", "title": "X", "charts": [chart]}
     (folder / "fuzzed" / "study-a.svg").write_bytes(b"<svg/>")
+    _frames(folder / "good_frames")
+    frames = (folder / "good_frames" / "frames.json").read_bytes()
+    write_scans(folder / "good_scans", [RangeScan(np.full((11, 14), 400.0), CAMERA, name="p")], step_mm=0.02)
+    scans = json.loads((folder / "good_scans" / "scans.json").read_bytes())
+    scans["scans"][0] |= {"image": "p.png", "brightness": None}
     return [
         Entry(read_camera_json, "a.camera.json", (camera,)),
         Entry(lambda path: read_capture(path.parent), "capture.json", (json.dumps(capture).encode(),)),
         Entry(lambda path: _directions(path, 3), "lights.txt", (b"0 0 1\n1 0 2\n0 -1 1.5\n",)),
         Entry(read_index, "index.jsonl", (json.dumps(row).encode() + b"\n" + json.dumps(row | {"index": 1}).encode() + b"\n",)),
         Entry(lambda path: _charts(path.parent), "study.json", (json.dumps(study).encode(),)),
+        Entry(lambda path: _frames(path.parent), "frames.json", (frames,)),
+        Entry(_go_on, "unfinished.json", (b'{"schema": "rangecheck/unfinished/1", "key": "a"}\n',)),
+        Entry(read_manifest, "scans.json", (json.dumps(scans).encode(),)),
     ]
+
+
+def _frames(folder: Path) -> None:
+    """Two pictures of one pixel, made or taken up in the folder."""
+    try:
+        render_frames(
+            lambda index: np.full((1, 1), float(index)), 2, folder, "key", encode=lambda radiance, *_: radiance.tobytes()
+        )
+    finally:
+        for path in folder.glob("frame_*"):
+            path.unlink()
+
+
+def _go_on(path: Path) -> None:
+    """The job that is stopped in the file's folder, taken up."""
+    others = [one for one in path.parent.iterdir() if one.name != path.name]
+    with job_folder(path.parent, "a", "run.json", force=False):
+        assert all(one.exists() for one in others)
 
 
 def pictures(folder: Path) -> list[Entry]:
