@@ -212,3 +212,40 @@ def test_a_3mf_that_unpacks_to_many_times_its_size_is_refused_before_it_is_unpac
         read_mesh(path)
     assert tracemalloc.get_traced_memory()[1] < 4 << 20
     tracemalloc.stop()
+
+
+def three_mf(path, objects: str, items: str):
+    """A 3MF with these objects and items."""
+    kinds = '<Types xmlns="http://schemas.openxmlformats.org/package/2006/content-types"/>'
+    core = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
+    model = f'<model unit="millimeter" xmlns="{core}"><resources>{objects}</resources><build>{items}</build></model>'
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("[Content_Types].xml", kinds)
+        archive.writestr("3D/3dmodel.model", model)
+    return path
+
+
+TETRAHEDRON = (
+    '<object id="1" type="model"><mesh><vertices><vertex x="0" y="0" z="0"/><vertex x="6" y="0" z="0"/><vertex x="0" y="6" z="0"/>'
+    '<vertex x="0" y="0" z="6"/></vertices><triangles><triangle v1="0" v2="2" v3="1"/><triangle v1="0" v2="1" v3="3"/>'
+    '<triangle v1="0" v2="3" v3="2"/><triangle v1="1" v2="2" v3="3"/></triangles></mesh></object>'
+)
+
+
+def test_parts_of_parts_of_a_3mf_are_placed_each_time_and_mirrored_ones_still_face_outward(tmp_path):
+    mirrored = '<component objectid="1" transform="-1 0 0 0 1 0 0 0 1 -20 0 0"/>'
+    pair = f'<object id="2"><components><component objectid="1"/>{mirrored}</components></object>'
+    moved = '<item objectid="2" transform="1 0 0 0 1 0 0 0 1 0 50 0"/>'
+    surface = read_mesh(three_mf(tmp_path / "four.3mf", TETRAHEDRON + pair, f'<item objectid="2"/>{moved}'))
+    assert len(surface.faces) == 16
+    assert surface.volume_mm3 == pytest.approx(4 * 36.0)
+
+
+@pytest.mark.parametrize("last", ["1", "29"])
+def test_a_3mf_whose_parts_hold_each_other_too_often_or_in_a_circle_is_refused(tmp_path, last):
+    twice = "".join(
+        f'<object id="{k}"><components>{f"""<component objectid="{last if k == 2 else k - 1}"/>""" * 2}</components></object>'
+        for k in range(2, 30)
+    )
+    with pytest.raises(InputError, match="places its parts more than"):
+        read_mesh(three_mf(tmp_path / "deep.3mf", TETRAHEDRON + twice, '<item objectid="29"/>'))

@@ -8,9 +8,12 @@ nothing is merged by nearness, dropped or turned. The labels of rangecheck's own
 from __future__ import annotations
 
 import io
+import re
 import zipfile
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +28,12 @@ from rangecheck.surface.weld import weld_exactly
 
 #: how many times its size a 3MF may unpack to (meshes do to 6 to 8), and up to how many bytes that is not asked
 MOST_SWELLING, SWELLS_FREELY = 60, 1 << 25
+#: times that a 3MF may place its parts
+MOST_PLACED = 100_000
+#: of a 3MF: the member of the archive, and the object in it
+_Part = tuple[str, str]
+_PLACING = re.compile(rb"<(?:\w+:)?(object|component|item)\b([^>]*)>")
+_ATTRIBUTE = re.compile(rb"([\w:]+)\s*=\s*([\"'])(.*?)\2")
 FORMATS = ("stl", "ply", "obj", "off", "glb", "3mf")
 #: float32, in which STL is written and rays are traced, holds squares of lengths up to 1.8e19 mm
 LARGEST_MM = 1e18
@@ -230,6 +239,37 @@ def _refuse_to_swell(path: Path, content: bytes) -> None:
         )
 
 
+def _refuse_to_multiply(path: Path, content: bytes) -> None:
+    """Refuse a 3MF whose components of components place its parts more often than its reader follows; it would leave the rest out."""
+    inside: dict[_Part, list[_Part]] = {}
+    placed: Counter[_Part] = Counter()
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        for member in archive.namelist():
+            within: _Part | None = None
+            for tag, attributes in _PLACING.findall(archive.read(member) if member.endswith(".model") else b""):
+                named = {key.rpartition(b":")[2]: value.decode("latin1") for key, _, value in _ATTRIBUTE.findall(attributes)}
+                if tag == b"object":
+                    within = member, named.get(b"id", "")
+                    continue
+                part = named.get(b"path", member).strip("/"), named.get(b"objectid", "")
+                if tag == b"item":
+                    placed[part] += 1
+                elif within is not None:
+                    inside.setdefault(within, []).append(part)
+    times = 0
+    for _ in range(len(inside) + 1):  # one level of components after another; a circle of them has no last
+        times += placed.total()
+        below: Counter[_Part] = Counter()
+        for part, count in placed.items():
+            for component in inside.get(part, ()):
+                below[component] += count
+        placed = below
+        if not placed or times > MOST_PLACED:
+            break
+    if placed or times > MOST_PLACED:
+        raise InputError(path, f"places its parts more than {MOST_PLACED} times, in each other; export it again as one mesh")
+
+
 def _through_trimesh(path: Path, content: bytes, kind: str) -> tuple[FloatArray, IntArray, str]:
     """Vertices, faces and unit of GLB or 3MF, all instances placed by their transforms."""
     try:
@@ -238,20 +278,40 @@ def _through_trimesh(path: Path, content: bytes, kind: str) -> tuple[FloatArray,
         raise DependencyMissing("trimesh", f"reading {kind.upper()}", "pip install trimesh") from None
     if kind == "3mf":
         _refuse_to_swell(path, content)
+        _refuse_to_multiply(path, content)
     try:
         scene = trimesh.load_scene(io.BytesIO(content), file_type=kind)
-        mesh = scene.to_mesh() if scene.geometry else None
+        vertices, faces = _placed(scene, trimesh.Trimesh)
     except ImportError as error:
         raise DependencyMissing(
             error.name or "a package", f"reading {kind.upper()}", "pip install 'rangecheck[formats]'"
         ) from None
     except Exception as error:  # a foreign reader may raise anything on a damaged file
         raise InputError(path, f"cannot be read as {kind.upper()} ({type(error).__name__}: {error}); export it again") from None
-    if mesh is None:
+    if len(faces) == 0:
         raise InputError(path, "holds no faces; export it again")
     said = "m" if kind == "glb" else _UNITS_3MF.get(str(scene.units or "millimeter").rstrip("s"), "mm")
-    if len(mesh.faces) and not 0 <= np.min(mesh.faces) <= np.max(mesh.faces) < len(mesh.vertices):
-        raise InputError(path, f"its faces name vertices outside the {len(mesh.vertices)} that it has; export it again")
+    if not 0 <= np.min(faces) <= np.max(faces) < len(vertices):
+        raise InputError(path, f"its faces name vertices outside the {len(vertices)} that it has; export it again")
     # each primitive of GLB brings all vertices of its buffer: keep those that it uses
-    used, faces = np.unique(mesh.faces, return_inverse=True)
-    return np.asarray(mesh.vertices, np.float64)[used], faces.reshape(-1, 3), said
+    used, faces = np.unique(faces, return_inverse=True)
+    return vertices[used], faces.reshape(-1, 3), said
+
+
+def _placed(scene: Any, kind: Any) -> tuple[FloatArray, IntArray]:
+    """All instances of the scene's meshes where its transforms place them; mirrored ones turned inside out, as they look."""
+    meshes = {
+        name: (np.asarray(part.vertices, np.float64), np.asarray(part.faces, np.int64))
+        for name, part in scene.geometry.items()
+        if isinstance(part, kind)
+    }
+    vertices, faces, start = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], 0
+    for node in scene.graph.nodes_geometry:
+        matrix, name = scene.graph[node]
+        if name not in meshes:
+            continue  # lines and points
+        own, rings = meshes[name]
+        vertices.append(own @ matrix[:3, :3].T + matrix[:3, 3])
+        faces.append((rings[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else rings) + start)
+        start += len(own)
+    return np.concatenate(vertices), np.concatenate(faces)
