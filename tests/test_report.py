@@ -148,6 +148,26 @@ def test_the_likeness_on_disk_is_the_bust_of_the_job(job):
     assert np.isfinite(error).any() and coverage_counts.max() >= 1
 
 
+def test_what_the_scans_lack_stands_in_the_table_with_places_and_what_mends_it(job):
+    content = json.loads((job / "run.json").read_text())
+    remarks = content["quality"]["findings"]
+    unseen = next(f for f in remarks if f["code"] == "scan-unseen")
+    assert len(unseen["places_mm"]) == min(20, content["quality"]["gaps"])
+    rows = {f.code: f for f in page_of(job, content).findings}
+    assert {f["code"] for f in remarks} <= set(rows)
+    np.testing.assert_array_equal(rows["scan-unseen"].places_mm, unseen["places_mm"])
+    assert "next view" in rows["scan-unseen"].mend
+    # a bust that was scaled is elsewhere than its scans
+    content["settings"]["solid"]["height_mm"] = 50.0
+    moved = {f.code: f for f in page_of(job, content).findings}["scan-unseen"]
+    assert not len(moved.places_mm) and moved.where == "all scans"
+
+
+def test_focal_points_stand_in_the_order_of_their_azimuths(job):
+    labels = [float(m.label.removesuffix("°")) for m in page_of(job, json.loads((job / "run.json").read_text())).distance_maps]
+    assert labels == sorted(labels) and len(labels) > 12
+
+
 def test_large_pictures_become_lighter():
     from rangecheck.export.pictures import png_bytes
     from rangecheck.report import Scan

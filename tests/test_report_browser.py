@@ -116,10 +116,37 @@ def test_a_section_cuts_the_bust_where_it_says(page):
 def test_a_click_on_a_finding_takes_the_view_there(page):
     before = pose(page)
     place = page.run("data.findings[0].places[0]")
-    page.run("document.querySelector('button.show').click()")
+    page.run("document.querySelector('tbody button.show').click()")
     page.until(f"JSON.parse(document.getElementById('view').dataset.pose).distance < {0.5 * before['distance']}")
     np.testing.assert_allclose(pose(page)["target"], place, atol=1e-6)
     assert page.run("document.activeElement.id") == "view"
+
+
+def test_a_click_anywhere_in_a_row_goes_to_its_finding(page):
+    before = pose(page)
+    index = page.run("[...document.querySelectorAll('tbody tr')].findIndex((row) => row.classList.contains('placed'))")
+    place = page.run(f"data.findings[{index}].places[0]")
+    page.run("document.querySelector('tr.placed td:last-child').click()")
+    page.until(f"JSON.parse(document.getElementById('view').dataset.pose).distance < {0.5 * before['distance']}")
+    np.testing.assert_allclose(pose(page)["target"], place, atol=1e-6)
+
+
+def test_the_ringed_places_of_the_turntable_are_shown_one_after_the_other(page):
+    places = page.run("data.findings.at(-1).places")
+    assert page.run("data.findings.at(-1).code") == "stands out" and len(places) > 1
+    for place in places[:2]:
+        page.run("document.querySelector('.ringed button.show').click()")
+        page.until(f"JSON.parse(document.getElementById('view').dataset.pose).target[0] === {place[0]}")
+        np.testing.assert_allclose(pose(page)["target"], place, atol=1e-6)
+
+
+def test_paper_shows_what_the_screen_folds(page):
+    assert page.run("document.querySelectorAll('details:not([open])').length") > 1
+    page.run("dispatchEvent(new Event('beforeprint'))")
+    assert page.run("document.querySelectorAll('details:not([open])').length") == 0
+    page.run("dispatchEvent(new Event('afterprint'))")
+    assert page.run("document.querySelectorAll('details:not([open])').length") > 1
+    assert len(page.call("Page.printToPDF")["data"]) > 10_000
 
 
 def test_the_value_under_the_cursor_is_the_measured_distance(page, job):

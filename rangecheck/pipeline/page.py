@@ -44,6 +44,7 @@ from rangecheck.scan import RangeScan
 from rangecheck.scan.quality_sphere import counted
 from rangecheck.scan.readers.limits import beside
 from rangecheck.solid import Verdict
+from rangecheck.solid.findings import explain
 from rangecheck.surface import Surface
 
 #: focal points of the ring, counted from the front, and the longer side of their maps in pixels
@@ -169,7 +170,6 @@ def page_of(folder: Path, content: dict[str, Any], studies: Sequence[str | Path]
         reasons=_reasons(content),
         scans=[_scan(folder, facts, quality) for facts in content["scans"]],
         worth=_worth(quality),
-        remarks=[(found["severity"], found["text"]) for found in (quality or {}).get("findings", ())],
         coverage=None if kept is None or not kept["coverage"].any() else _coverage(kept["coverage"], quality),
         model=None if kept is None else _model(kept),
         front_deg=content.get("front_deg", 0.0),
@@ -179,15 +179,18 @@ def page_of(folder: Path, content: dict[str, Any], studies: Sequence[str | Path]
             if (frames := sorted(beside(folder / "run.json", f"frames/{t['material']}").glob("*.png")))
         ],
         distance_maps=_distance_maps(folder),
-        findings=[
-            Finding(f["code"], f["severity"], f["count"], f["message"], f["why"], f["mend"], np.reshape(f["places_mm"], (-1, 3)))
-            for f in content["verdict"]["findings"]
-        ],
+        findings=[*_findings_of_solid(content), *_findings_of_scans(content)],
         shown=[
-            Figure("Consistency", "", read_bytes(path), alt=f"Places that the turntable flags, from the {side}")
+            Figure(
+                "Consistency",
+                f"From the {side}. {_RINGS}",
+                read_bytes(path),
+                alt=f"Places that the turntable flags, from the {side}",
+            )
             for side in ("front", "back")
             if (path := folder / "consistency" / f"consistency_{side}.png").is_file()
         ],
+        stands_out=np.reshape([place["centre_mm"] for place in (content.get("consistency") or {}).get("places", ())], (-1, 3)),
         charts=[figure for study in studies for figure in _charts(Path(study))],
         decisions=[*content["decisions"], *(f"{t['material']}: {line}" for t in content["turntables"] for line in t["plan"])],
         settings=json.dumps(content["settings"], indent=1),
@@ -200,6 +203,28 @@ def page_of(folder: Path, content: dict[str, Any], studies: Sequence[str | Path]
     )
 
 
+def _findings_of_solid(content: dict[str, Any]) -> list[Finding]:
+    return [
+        Finding(f["code"], f["severity"], f["count"], f["message"], f["why"], f["mend"], np.reshape(f["places_mm"], (-1, 3)))
+        for f in content["verdict"]["findings"]
+    ]
+
+
+def _findings_of_scans(content: dict[str, Any]) -> list[Finding]:
+    """What the scans are not good for; their places are the bust's where it has their size."""
+    same_place = content["settings"]["solid"].get("height_mm") is None
+    found = []
+    for f in (content.get("quality") or {}).get("findings", ()):
+        told, places = explain(f["code"]), f.get("places_mm", ()) if same_place else ()
+        where = f"scan {f['scan']}" if f["scan"] else "all scans"
+        found.append(Finding(f["code"], f["severity"], 1, f["text"], told.why, told.mend, np.reshape(places, (-1, 3)), where))
+    return found
+
+
+_RINGS = (
+    "Colour is the angle between a facet and what its neighbours let expect: hair and folds are rough by themselves. Rings mark where it "
+    "is far larger than around it."
+)
 _FILES = (
     ("bust.stl", "the solid, for the slicer"),
     ("surface.ply", "the surface, each face labelled measured, interpolated or invented"),
@@ -319,7 +344,7 @@ def _model(kept: dict[str, Any]) -> Model:
 
 
 def _distance_maps(folder: Path) -> list[DistanceMap]:
-    """The maps asked for, then the rest of the ring."""
+    """The maps asked for and the rest of the ring, by azimuth."""
     found: dict[float, DistanceMap] = {}
     for path in sorted((folder / "maps").glob("azimuth_*/maps.npz"), key=lambda p: float(p.parent.name.split("_")[1])):
         one, azimuth = read_maps_npz(path), float(path.parent.name.split("_")[1])
@@ -333,7 +358,7 @@ def _distance_maps(folder: Path) -> list[DistanceMap]:
         if azimuth % 360 not in {known % 360 for known in found}:
             inner, distance = tuple(ring["intrinsics"].tolist()), ring["distance_mm"][k].astype(np.float64)
             found[float(azimuth)] = DistanceMap(f"{azimuth:g}°", distance, inner, ring["world_from_camera"][k])
-    return list(found.values())
+    return [found[azimuth] for azimuth in sorted(found, key=lambda a: a % 360)]
 
 
 def _drawn(path: Path, study: dict[str, Any]) -> list[tuple[str, str]]:

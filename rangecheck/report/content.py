@@ -52,7 +52,7 @@ class Turntable:
 
 @dataclass(frozen=True)
 class Finding:
-    """One row of the findings table; places_mm (k, 3) are marked in the 3-D view."""
+    """One row of the findings table; places_mm (k, 3) are marked in the 3-D view. `where` says where it is when there are none."""
 
     code: str
     severity: str
@@ -61,6 +61,7 @@ class Finding:
     why: str
     mend: str
     places_mm: FloatArray = field(default_factory=lambda: np.empty((0, 3)), repr=False)
+    where: str = "everywhere"
 
 
 @dataclass(frozen=True)
@@ -132,9 +133,9 @@ class DistanceMap:
 
 @dataclass(frozen=True)
 class ReportContent:
-    """Everything the report shows. `worth` are facts about all scans together, `remarks`
-    (severity, sentence) what is to be said of them; `shown` are
-    pictures of what the turntable shows, measured; `provenance` are groups of facts by heading.
+    """Everything the report shows. `findings` are those of the solid, then those of its scans; `worth` are facts about all scans together;
+    `shown` are pictures of what the turntable shows, measured, and `stands_out` (k, 3) the places ringed there; `provenance` are groups of
+    facts by heading.
 
     Azimuths of turntables and focal points count from the front, which lies `front_deg` from +z towards +x."""
 
@@ -144,7 +145,6 @@ class ReportContent:
     reasons: Sequence[str]
     scans: Sequence[Scan] = ()
     worth: Sequence[tuple[str, str]] = ()
-    remarks: Sequence[tuple[str, str]] = ()
     coverage: Coverage | None = None
     model: Model | None = None
     turntables: Sequence[Turntable] = ()
@@ -152,6 +152,7 @@ class ReportContent:
     front_deg: float = 0.0
     findings: Sequence[Finding] = ()
     shown: Sequence[Figure] = ()
+    stands_out: FloatArray = field(default_factory=lambda: np.empty((0, 3)), repr=False)
     charts: Sequence[Figure] = ()
     decisions: Sequence[str] = ()
     settings: str = "{}"

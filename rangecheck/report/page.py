@@ -32,6 +32,8 @@ _QUALITIES = (88, 80, 70)
 _PICTURE_BYTES, _PICTURE_PX, _PICTURE_QUALITY = 60_000, 800, 86
 _STOPS = 33
 _SCRIPTS = ("shared.js", "turn.js", "controls.js", "viewer.js", "maps.js")
+#: what the page calls the places that the turntable rings; no finding: a place that bends unlike its surroundings may well be form
+STANDS_OUT = "stands out"
 _LIBRARY = ("three.core.min.js", "three.module.min.js")
 
 
@@ -54,6 +56,8 @@ def report_html(content: ReportContent) -> str:
     data["findings"] = [
         {"code": f.code, "severity": f.severity, "places": np.round(f.places_mm, 3).tolist()} for f in content.findings
     ]
+    if len(content.stands_out):
+        data["findings"].append({"code": STANDS_OUT, "severity": "note", "places": np.round(content.stands_out, 3).tolist()})
     if content.model is not None:
         data["model"] = _model_form(content.model)
         data["library"] = [_deflated((room / "vendor" / name).read_bytes()) for name in _LIBRARY]

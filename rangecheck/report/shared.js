@@ -11,6 +11,12 @@ const when = (name, listener) => { (told[name] ||= []).push(listener); };
 /** Tell all listeners of `name` but the one it comes from. */
 const tell = (name, value, from) => { for (const listener of told[name] || []) if (listener !== from) listener(value); };
 
+/* on paper nothing can be opened: what is folded is printed unfolded */
+const folded = () => document.querySelectorAll("details:not([open])");
+let unfolded = [];
+addEventListener("beforeprint", () => { unfolded = [...folded()]; for (const one of unfolded) one.open = true; });
+addEventListener("afterprint", () => { for (const one of unfolded) one.open = false; });
+
 /** The bytes behind base64 of a deflated stream. */
 async function inflated(text) {
   const raw = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));

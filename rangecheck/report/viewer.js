@@ -155,6 +155,9 @@ async function startViewer() {
       visit(place);
     });
   }
+  // a row is a large target; the button in it is what keys and screen readers find
+  for (const row of document.querySelectorAll("tr.placed"))
+    row.addEventListener("click", (e) => { if (!e.target.closest("button, a") && !String(getSelection())) row.querySelector("button.show").click(); });
   when("place", (place) => { picked = place; markFindings(); visit(place); });
 
   const slider = byId("cut"), cutAt = byId("cut-at"), flip = byId("cut-flip");

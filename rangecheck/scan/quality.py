@@ -46,6 +46,8 @@ _COVERAGE, _CANDIDATES = 2048, 400
 _TO_ALIGN = 0.25
 #: heights of what range finders are pointed at; outside, the unit is in doubt
 LIKELY_MM = (5.0, 20_000.0)
+#: gaps whose places a remark keeps, the largest first
+_PLACES = 20
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,8 @@ PROFILES = {
 
 @dataclass(frozen=True)
 class Finding:
-    """One remark: what was measured, what is allowed, what mends it. `code` is stable; `scan` is empty for all together."""
+    """One remark: what was measured, what is allowed, what mends it. `code` is stable; `scan` is empty for all together; `places_mm` are
+    in the world frame, the worst first."""
 
     code: str
     severity: Literal["note", "warning", "error"]
@@ -87,6 +90,7 @@ class Finding:
     value: float
     limit: float
     scan: str = ""
+    places_mm: tuple[tuple[float, float, float], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -342,18 +346,19 @@ def _next_view(allowed: FloatArray, space: Space, up: FloatArray) -> NextView | 
 def _findings(views, wanted: Profile, scale, seen, unseen, spacing, error, step, gaps, middle, up) -> list[Finding]:
     found: list[Finding] = []
 
-    def add(code: str, value: float, limit: float, too_bad: float, text: str, scan: str = "") -> None:
+    def add(code: str, value: float, limit: float, too_bad: float, text: str, scan: str = "", places=()) -> None:
         worse = value > limit if too_bad >= limit else value < limit
         far = value > too_bad if too_bad >= limit else value < too_bad
         if worse:
-            found.append(Finding(code, "error" if far else "warning", text, value, limit, scan))
+            found.append(Finding(code, "error" if far else "warning", text, value, limit, scan, places))
 
     largest = f", the largest around ({', '.join(f'{x:z.0f}' for x in gaps[0].centre_mm)}) mm" if gaps else ""
     # what a single scan cannot see is no fault of it: never more than a warning
     add("scan-unseen", 1 - seen, wanted.most_unseen, 4 * wanted.most_unseen if len(views) > 1 else 1.0,
         f"{100 * (1 - seen):.1f} % of the surface in reach ({unseen / 100:.0f} cm2) was never seen (at most {100 * wanted.most_unseen:.0f} %), "
         f"in {len(gaps)} gaps{largest}; "
-        + ("one scan makes a relief, and a bust takes more" if len(views) == 1 else "scan again from the next view"))  # fmt: skip
+        + ("one scan makes a relief, and a bust takes more" if len(views) == 1 else "scan again from the next view"),
+        places=tuple(gap.centre_mm for gap in gaps[:_PLACES]))  # fmt: skip
     height = wanted.height_mm / scale
     if not LIKELY_MM[0] <= height <= LIKELY_MM[1]:
         found.append(Finding("scan-size", "warning", f"the object is {height:.3g} mm high (from {LIKELY_MM[0]:g} to {LIKELY_MM[1]:g} mm is likely); "
