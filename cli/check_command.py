@@ -10,7 +10,7 @@ from .common import common, settings_from
 @click.option("--opinions", is_flag=True, help="Ask trimesh, MeshLab and manifold3d too.")
 @click.option("--printer", metavar="NAME", help="Judge for printing by a profile of configs/printers, or a profile file.")
 @click.option("--profile", metavar="NAME", help="What scans are judged for: bust-75, bust-150 or bust-300.")
-@common("register", "filter", "unit", "config", "set")
+@common("explain", "register", "filter", "unit", "config", "set")
 def command(files, opinions, printer, profile, register, filters, unit, config, assignments, reporter):
     """Check range scans or mesh files; verdict, findings with places, numbers.
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 import re
 import sys
 from collections.abc import Callable
@@ -44,9 +45,12 @@ class Size(click.ParamType):
 
 
 class Point(click.ParamType):
-    """X,Y,Z in millimetres."""
+    """Three finite numbers, `said` to be a point in millimetres unless something else."""
 
     name = "X,Y,Z"
+
+    def __init__(self, said: str = "a point; write X,Y,Z in millimetres, for example 0,150,900") -> None:
+        self.said = said
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
         if isinstance(value, tuple):
@@ -54,7 +58,9 @@ class Point(click.ParamType):
         try:
             x, y, z = (float(part) for part in value.split(","))
         except ValueError:
-            self.fail(f"{value!r} is not a point; write X,Y,Z in millimetres, for example 0,150,900", param, ctx)
+            x = y = z = math.nan
+        if not all(map(math.isfinite, (x, y, z))):
+            self.fail(f"{value!r} is not {self.said}", param, ctx)
         return x, y, z
 
 
@@ -131,6 +137,12 @@ _OPTIONS: dict[str, Callable[..., Any]] = {
     "log": click.option(
         "--log", type=click.Path(dir_okay=False), metavar="FILE", help="Append what is done, with the time, to FILE."
     ),
+    "dry_run": click.option(
+        "--dry-run", is_flag=True, help="Check inputs, settings, encoder, cluster and room on the disk; compute nothing."
+    ),
+    "explain": click.option(
+        "--explain", is_flag=True, help="Say of each finding what it means, why it matters and what mends it."
+    ),
     "force": click.option("--force", is_flag=True, help="Replace existing results."),
 }
 
@@ -151,7 +163,7 @@ def common(*names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
         @functools.wraps(function)
         def command(
             *args: Any, verbose: int, quiet: bool, threads: int | None, memory_mb: float | None, as_json: bool, log: str | None,
-            **kwargs: Any,
+            explain: bool = False, **kwargs: Any,
         ) -> int:  # fmt: skip
             if memory_mb:
                 click.get_current_context().call_on_close(bound_memory(memory_mb))
@@ -163,6 +175,10 @@ def common(*names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
             reporter = ConsoleReporter(-1 if quiet else verbose, Log(log) if log else None)
             try:
                 outcome: Outcome = function(*args, reporter=reporter, **kwargs)
+                if explain:
+                    from rangecheck.pipeline.inspect import explained
+
+                    outcome = explained(outcome)
                 for line in outcome.lines:
                     reporter.remember(line)
             except BaseException as error:

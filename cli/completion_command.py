@@ -12,7 +12,7 @@ WHERE = {
 
 
 @click.command("completion", short_help="Print the script that lets a shell complete commands and options.")
-@click.argument("shell", type=click.Choice(list(WHERE)))
+@click.argument("shell", metavar="bash|zsh|fish", type=click.Choice(list(WHERE)))
 @common()
 def command(shell, reporter):
     """Print the script that lets a shell complete commands and options.

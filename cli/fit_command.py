@@ -8,7 +8,10 @@ from .common import Point, common, settings_from
 @click.command("fit", short_help="Recover material and lamps from photographs of a known shape.")
 @click.argument("pictures", nargs=-1, required=True, type=click.Path())
 @click.option(
-    "--sphere", type=Point(), metavar="COLUMN,ROW,RADIUS", help="They show a sphere of this outline, pixels, from far away."
+    "--sphere",
+    type=Point("a circle; write COLUMN,ROW,RADIUS in pixels, for example 320,240,150"),
+    metavar="COLUMN,ROW,RADIUS",
+    help="They show a sphere of this outline, pixels, from far away.",
 )
 @click.option("--on", "model", type=click.Path(), metavar="MESH", help="They show this mesh, scan or modelled scene.")
 @click.option("--camera", type=Point(), metavar="X,Y,Z", help="Where the camera stood, mm; it looks at the middle of the object.")

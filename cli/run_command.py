@@ -15,8 +15,23 @@ from .common import common, settings_from
     metavar="ADDRESS",
     help="Make the frames, or with --each the subjects, on a dask cluster, for example tcp://10.0.0.1:8786.",
 )
-@click.option("--dry-run", is_flag=True, help="Check inputs, settings, encoder and room on the disk; compute nothing.")
-@common("out", "register", "filter", "refine", "unit", "size", "frames", "tolerance", "seed", "preset", "config", "set", "force")
+@common(
+    "dry_run",
+    "explain",
+    "out",
+    "register",
+    "filter",
+    "refine",
+    "unit",
+    "size",
+    "frames",
+    "tolerance",
+    "seed",
+    "preset",
+    "config",
+    "set",
+    "force",
+)
 def command(
     scans,
     method,
@@ -63,9 +78,7 @@ def command(
         picture__height=size and size[1],
     )
     if dry_run:
-        if each:
-            raise click.UsageError("--dry-run looks at one subject; leave --each away")
-        return rehearse(scans, out, settings=settings, unit=unit, force=force, reporter=reporter)
+        return rehearse(scans, out, settings=settings, unit=unit, force=force, reporter=reporter, scheduler=scheduler, each=each)
     if each:
         return run_each(scans, out, settings=settings, unit=unit, force=force, reporter=reporter, scheduler=scheduler)
     outcome = run(scans, out, settings=settings, unit=unit, force=force, reporter=reporter, scheduler=scheduler)

@@ -29,7 +29,12 @@ from .common import Point, common
 @click.option(
     "--ambient", type=click.FloatRange(0), default=0.0, show_default=True, help="Constant light, relative to the source's."
 )
-@click.option("--drift", type=Point(), metavar="X,Y,Z", help="How fast the object drifts meanwhile, mm/s.")
+@click.option(
+    "--drift",
+    type=Point("a velocity; write X,Y,Z in mm/s, for example 0,0,2"),
+    metavar="X,Y,Z",
+    help="How fast the object drifts meanwhile, mm/s.",
+)
 @click.option("--turn", type=float, default=0.0, metavar="DEG", help="How fast it turns meanwhile, degrees/s about y.")
 @click.option(
     "--finder", multiple=True, metavar="KEY=VALUE", help="Another number of the instrument, for example lost_share=0.1."

@@ -73,7 +73,7 @@ class Simplify(click.ParamType):
 @click.option("--orient", is_flag=True, help="Advise which way up to print: islands, overhang, largest layer, height.")
 @click.option("--ascii", is_flag=True, help="STL as text.")
 @click.option("--force-open", is_flag=True, help="Write STL even of what is no solid.")
-@common("out_file", "unit", "config", "set", "force")
+@common("explain", "out_file", "unit", "config", "set", "force")
 def command(mesh, out, unit, config, assignments, force, orient, ascii, force_open, reporter, **wanted):
     """Close, repair, base, hollow and simplify a mesh so that it can be built; export it.
 

@@ -37,17 +37,17 @@ from .common import common, settings_from, shipped
     "pictures of waves of light, nine from each of up to twelve poses; in a matt surface in the frames themselves, with --lights room.",
 )
 @click.option("--scheduler", metavar="ADDRESS", help="Make the frames on a dask cluster, for example tcp://10.0.0.1:8786.")
-@common("out_file", "unit", "size", "frames", "frames_dir", "tolerance", "seed", "config", "set", "force")
+@common("dry_run", "out_file", "unit", "size", "frames", "frames_dir", "tolerance", "seed", "config", "set", "force")
 def command(
     scene, materials, show, lights, elevation, swing, fps, frame_format, sheet, consistency, scheduler, out, unit, size, frames, frames_dir,
-    tolerance, seed, config, assignments, force, reporter,
+    tolerance, seed, config, assignments, force, dry_run, reporter,
 ):  # fmt: skip
     """Frames and video of an orbit; resumes where it was stopped. The video's name says what it becomes: .mp4, .webm, .gif or .apng.
 
     Frames are kept beside the video (or in --frames-dir), keyed by everything that determines them: a stopped run goes on, and
     gives the same bytes as one that was never stopped. Their cameras are beside them, as JSON and as a COLMAP model.
     """
-    from rangecheck.pipeline import turntable
+    from rangecheck.pipeline import rehearse_turntable, turntable
 
     settings = settings_from(
         config,
@@ -64,6 +64,11 @@ def command(
         picture__width=size and size[0],
         picture__height=size and size[1],
     )
+    if dry_run:
+        return rehearse_turntable(
+            scene, out, settings=settings, unit=unit, frames_dir=frames_dir, materials=materials, sheet=sheet, scheduler=scheduler,
+            force=force, reporter=reporter,
+        )  # fmt: skip
     return turntable(
         scene,
         out,

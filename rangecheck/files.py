@@ -127,7 +127,7 @@ def read_bytes(path: str | Path, limit: int | None = None) -> bytes:
     except IsADirectoryError:
         raise InputError(path, "is a folder, and a file is needed") from None
     except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})") from None
+        raise InputError(path, f"cannot be read ({error.strerror}); ask for the right to, or copy it") from None
 
 
 def sha256(path: str | Path) -> str:
@@ -136,8 +136,10 @@ def sha256(path: str | Path) -> str:
     try:
         with path.open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
+    except FileNotFoundError:
+        raise InputError(path, "does not exist; check the name") from None
     except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})") from None
+        raise InputError(path, f"cannot be read ({error.strerror}); ask for the right to, or copy it") from None
 
 
 def presets_folder() -> Path:

@@ -118,6 +118,32 @@ def test_a_rehearsal_says_what_a_job_would_need_and_leaves_nothing(capsys, tmp_p
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("command", ["turntable", "dataset", "run --each"])
+def test_every_long_job_can_be_rehearsed(command, capsys, tmp_path, sample_data):
+    out = tmp_path / ("film.mp4" if command == "turntable" else "out")
+    where = "--out" if command.startswith("run") else "-o"
+    assert exit_status([*command.split(), str(sample_data / "frontal"), where, str(out), "--dry-run", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["command"] == command.split()[0] and 0 < told["bytes_needed"] < told["bytes_free"]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_rehearsal_asks_the_scheduler_whether_it_is_there(capsys, tmp_path, sample_data):
+    asked = ["run", sample_data / "frontal", "--out", tmp_path / "out", "--dry-run", "--scheduler"]
+    assert "'nonsense' is no address of a dask scheduler" in complaint(capsys, *asked, "nonsense")
+
+
+def test_findings_are_explained_where_they_are_told(capsys, tmp_path):
+    mesh = tmp_path / "face.stl"
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4")
+    mesh.write_bytes(b"\0" * 80 + np.uint32(1).tobytes() + np.zeros(3, "<f4").tobytes() + corners.tobytes() + b"\0\0")
+    assert exit_status(["check", str(mesh), "--unit", "mm", "-q"]) == 1
+    before = capsys.readouterr().out
+    assert exit_status(["check", str(mesh), "--unit", "mm", "-q", "--explain"]) == 1
+    after = capsys.readouterr().out
+    assert after.startswith(before) and after[len(before) :].startswith("open-edges: open edges\n  why:  ")
+
+
 def test_a_rehearsal_refuses_a_disk_that_is_too_small(capsys, tmp_path, sample_data, monkeypatch):
     monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=1_000_000))
     said = complaint(capsys, "run", sample_data / "frontal", "--out", tmp_path / "out", "--dry-run")

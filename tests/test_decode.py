@@ -356,7 +356,7 @@ def test_the_last_numbered_pictures_of_one_camera_may_be_missing(tmp_path, both)
 
 
 def test_folders_without_pictures_are_named(tmp_path):
-    with pytest.raises(InputError, match="not a folder"):
+    with pytest.raises(InputError, match="does not exist; check the name"):
         read_capture(tmp_path / "no")
     with pytest.raises(InputError, match=r"neither capture.json nor"):
         read_capture(tmp_path)

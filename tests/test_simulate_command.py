@@ -113,7 +113,7 @@ def test_pictures_of_the_patterns_are_decoded_to_the_truth_beside_them(meshes, t
 @pytest.mark.parametrize(
     "options, message",
     [
-        (["--finder", "lost=1"], "is not KEY=VALUE of a range finder; its keys are source_mm"),
+        (["--finder", "lost=1"], "a range finder has no .lost.; its numbers are source_mm"),
         (["--finder", "columns=many"], "columns is 'many'; it must be a whole number"),
         (["--finder", "source_mm=1,x,2"], "it must be three numbers"),
         (["--finder", "lost_share=2"], "lost_share is 2.0; it must lie between 0 and 1"),

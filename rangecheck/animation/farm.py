@@ -11,6 +11,7 @@ arrays and plain values, and functions by their names. Each of a worker's thread
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections import Counter
@@ -58,6 +59,10 @@ class Farm:
             raise DependencyMissing("distributed", "frames on other machines", "pip install 'rangecheck[distributed]'") from None
         import dask
 
+        if not re.fullmatch(r"([a-z]+://)?\S+:\d+", address) and not address.startswith("inproc://"):
+            raise RangecheckError(
+                f"{address!r} is no address of a dask scheduler; write tcp://HOST:PORT, for example tcp://10.0.0.1:8786"
+            )
         self.address, self.timeout_s = address, timeout_s
         dask.config.set({"distributed.scheduler.allowed-failures": LOST_WORKERS})
         try:

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic_core import PydanticCustomError
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -41,7 +42,9 @@ class Scanning(Section):
         False, description="heights refined, within their noise, by the shading of a scan's brightness (linear in light)"
     )
     quality: bool = Field(True, description="measure what the scans are worth, with the next view")
-    profile: str = Field("bust-150", description="what they are judged for: bust-75, bust-150 or bust-300")
+    profile: Literal["bust-75", "bust-150", "bust-300"] = Field(
+        "bust-150", description="what they are judged for: a print of that height in mm"
+    )
 
 
 class Meshing(Section):
@@ -109,6 +112,13 @@ class Solidify(Section):
         description="z: STL and 3MF stand on z = 0 as slicers take them, and are read here as they were; scan: the frame of the scans, y up",
     )
     printer: str | None = Field(None, description="a profile of configs/printers, or a profile file, that the part is judged for")
+
+    @field_validator("print_up")
+    @classmethod
+    def _points_somewhere(cls, up: tuple[float, float, float]) -> tuple[float, float, float]:
+        if not any(up):
+            raise PydanticCustomError("no_direction", "a direction is not all noughts; write for example [0, 1, 0]")
+        return up
 
 
 class Picture(Section):

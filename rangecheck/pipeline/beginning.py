@@ -1,11 +1,10 @@
-"""Before the work: a commented settings file to start from, the shapes of all documents, and a rehearsal of a job that computes nothing."""
+"""Before the work: a commented settings file to start from, and the shapes of all documents."""
 
 from __future__ import annotations
 
 import difflib
 import json
-import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,24 +14,10 @@ from pydantic.fields import FieldInfo
 
 from rangecheck.config import Settings
 from rangecheck.errors import OutputError, SettingError
-from rangecheck.export.video import find_encoder
 from rangecheck.files import write_bytes, write_json
 from rangecheck.pipeline.documents import CONFIGURATION, schemas
-from rangecheck.pipeline.folder import check_free
-from rangecheck.pipeline.job import FINISHED
 from rangecheck.pipeline.outcome import Outcome, document
-from rangecheck.pipeline.subject import read_all_scans
 from rangecheck.pipeline.views import refuse_existing
-from rangecheck.progress import Reporter
-from rangecheck.reflectance import load_material
-from rangecheck.scan.point_cloud import PointCloud
-
-#: bytes that a job leaves: of a face in the STL and the surface (their faces are at most three a distance), of a pixel of a frame
-#: with its film, of a pixel of the maps at one focal point
-BYTES_A_FACE, FACES_A_DISTANCE = 50 + 30, 3
-BYTES_A_PIXEL, BYTES_A_MAP_PIXEL = 1.5, 16
-#: the report, contour pictures and what else does not grow
-BYTES_BESIDES = 20_000_000
 
 
 def init(out: str, *, force: bool) -> Outcome:
@@ -126,44 +111,3 @@ def _toml(value: Any) -> str:
     if isinstance(value, (list, tuple)):
         return "[" + ", ".join(map(_toml, value)) + "]"
     return json.dumps(value)
-
-
-def rehearse(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None, force: bool, reporter: Reporter) -> Outcome:
-    """What `run` would start with, checked without computing anything: inputs, settings, materials, encoder, folder, room on the disk."""
-    check_free(out, FINISHED, force=force)
-    encoder = find_encoder(".mp4")
-    materials = [load_material(name) for name in settings.light.materials]
-    measured = read_all_scans(scans, unit, reporter)
-    distances = sum(len(one.points_mm) if isinstance(one, PointCloud) else int(one.valid.sum()) for one in measured)
-    pixels = settings.picture.width * settings.picture.height
-    needed = int(
-        distances * FACES_A_DISTANCE * BYTES_A_FACE
-        + pixels * settings.turntable.frames * len(materials) * BYTES_A_PIXEL
-        + pixels * len(settings.maps.azimuths_deg) * BYTES_A_MAP_PIXEL
-        + BYTES_BESIDES
-    )
-    free = shutil.disk_usage(_nearest_existing(Path(out))).free
-    if free < needed:
-        raise OutputError(
-            out, f"may need {needed / 1e6:,.0f} MB and has {free / 1e6:,.0f} MB free; make room, choose another folder, or smaller pictures"
-        )  # fmt: skip
-    lines = [
-        f"{len(measured)} scan{'s' if len(measured) != 1 else ''}, {distances:,} distances, can be read",
-        f"materials: {', '.join(material.name for material in materials)}; {settings.turntable.frames} frames of "
-        f"{settings.picture.width}x{settings.picture.height} each",
-        f"encoder: {encoder}",
-        f"{out}: free to use; at most {needed / 1e6:,.0f} MB are needed, {free / 1e6:,.0f} MB are free",
-        "nothing was computed; leave --dry-run away to begin",
-    ]
-    return Outcome(
-        document("rehearsal", scans=len(measured), distances=distances, bytes_needed=needed, bytes_free=free, encoder=encoder,
-                 settings=settings.model_dump(mode="json")),
-        lines,
-    )  # fmt: skip
-
-
-def _nearest_existing(path: Path) -> Path:
-    path = path.absolute()
-    while not path.exists():
-        path = path.parent
-    return path

@@ -194,8 +194,9 @@ def _documents() -> dict[str, tuple[Any, ...]]:
             record(subjects=many(with_others(record(name=TEXT, folder=TEXT, fit=FLAG, said=TEXT))), fit=FLAG, seconds=NUMBERS),
         ),
         "rehearsal": (
-            "`run --dry-run`",
-            record(scans=COUNT, distances=COUNT, bytes_needed=COUNT, bytes_free=COUNT, encoder=TEXT, settings=ref("settings")),
+            "--dry-run of `run`, `turntable` and `dataset`",
+            record(command=TEXT, scans=maybe(COUNT), distances=maybe(COUNT), pictures=maybe(COUNT), bytes_needed=COUNT, bytes_free=COUNT,
+                   encoder=maybe(TEXT), settings=ref("settings")),
         ),
         "check": ("`check`: a row for each file", record(fit=FLAG, files=many({"anyOf": [mesh_checked, scans_checked]}), seconds=NUMBERS)),
         "mesh": (

@@ -52,11 +52,13 @@ def fit(
 
         return fit_scan(pictures[0], out, response=response, unit=unit, scale_mm=scale_mm, force=force, reporter=reporter)
     if (sphere is None) == (model is None):
-        raise SettingError("name what the pictures show: --sphere COLUMN,ROW,RADIUS or --on MESH", key="sphere")
+        raise SettingError("name what the pictures show, one of --sphere COLUMN,ROW,RADIUS and --on MESH", key="sphere")
     with reporter.stage("reading pictures"):
         values = [_linear(Path(p), response) for p in pictures]
     if len({v.shape for v in values}) > 1:
         raise InputError(pictures[0], "has another size than the other pictures; give pictures of one size")
+    if sphere is not None:
+        _refuse_beside(sphere, values[0].shape[1], values[0].shape[0])
     if calibrate is not None:
         if sphere is None:
             raise SettingError("lamps are calibrated on a sphere; add --sphere COLUMN,ROW,RADIUS", key="calibrate")
@@ -234,6 +236,16 @@ def _look(
     camera = PinholeCamera.from_field_of_view(shape[1], shape[0], field_deg)
     pose = np.array(rigid.look_at(camera_mm, surface.bounds_mm.mean(axis=0)))
     return _Look(scene, EmbreeCaster(surface.vertices, surface.faces), camera, pose)
+
+
+def _refuse_beside(sphere: tuple[float, float, float], width: int, height: int) -> None:
+    """Raises SettingError unless the circle's middle is in the picture, which it does not exceed."""
+    column, row, radius = sphere
+    if not (0 <= column < width and 0 <= row < height and 0 < 2 * radius <= max(width, height)):
+        raise SettingError(
+            f"--sphere: a circle of radius {radius:g} around column {column:g}, row {row:g} is not in a picture of {width}x{height}; give its outline "
+            "as the picture shows it", key="sphere",
+        )  # fmt: skip
 
 
 def _calibrated(

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from rangecheck.config import Settings
-from rangecheck.errors import InputError, PosesRefused
+from rangecheck.errors import InputError, OutputError, PosesRefused
 from rangecheck.files import sha256
+from rangecheck.pipeline.folder import check_writable
 from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.preparing import counted, prepared, scan_facts
 from rangecheck.pipeline.subject import holds_scans, read_all_scans
@@ -117,12 +119,37 @@ def explain(code: str | None) -> Outcome:
     )
 
 
+def explained(outcome: Outcome) -> Outcome:
+    """The same with what each finding in its document means, why it matters and what mends it, each code once."""
+    lines: list[str] = []
+    for code in dict.fromkeys(_codes(outcome.document)):
+        entry = explain_code(code)
+        lines += [f"{entry.code}: {entry.title}", f"  why:  {entry.why}", f"  mend: {entry.mend}"]
+    return replace(outcome, lines=[*outcome.lines, *(lines or ["no findings to explain"])])
+
+
+def _codes(content: Any) -> Iterator[str]:
+    """The codes of findings anywhere in a document, in its order."""
+    if isinstance(content, dict):
+        if "severity" in content and content.get("code") in catalogue():
+            yield content["code"]
+        for value in content.values():
+            yield from _codes(value)
+    elif isinstance(content, list):
+        for value in content:
+            yield from _codes(value)
+
+
 def materials(names: Sequence[str], out: str | None, *, force: bool, reporter: Reporter) -> Outcome:
     """Each material's numbers, source and energy table; with `out`, a polar plot of each there."""
     from rangecheck.files import write_bytes
     from rangecheck.reflectance import energy_table, load_material, material_names, polar_chart
     from rangecheck.scan.readers.limits import plain_name
 
+    if out:
+        check_writable(out)
+        if Path(out).is_file():
+            raise OutputError(out, "is a file; the plots need a folder")
     lines: list[str] = []
     found: list[dict[str, Any]] = []
     taken: set[str] = set()
@@ -157,7 +184,6 @@ def materials(names: Sequence[str], out: str | None, *, force: bool, reporter: R
 
 def study(name: str, out: str, *, quick: bool, force: bool, reporter: Reporter, part: str | None = None) -> Outcome:
     """A study of speed against accuracy and of stability, made again on this machine; charts and numbers in `out`."""
-    from rangecheck.pipeline.folder import check_writable
     from rangecheck.studies import study_named
     from rangecheck.study import write_study
 

@@ -36,10 +36,7 @@ def run_each(
     """Each of `scans` is a subject of its own; its results go to a folder in `out` that bears its name.
 
     A subject that is refused does not stop the others; the outcome is fit when all are. Raises SettingError when two bear one name."""
-    names = [Path(path).resolve().name.split(".")[0] for path in scans]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise SettingError(f"two subjects are called {twice[0]}; results are told apart by the name, so rename one", key=twice[0])
+    names = folder_names(scans)
     check_writable(out)
     here = [str(Path(path).resolve()) for path in scans]
     job = Subjects(tuple(here), tuple(str(Path(out).resolve() / name) for name in names), settings, unit, force)
@@ -59,6 +56,15 @@ def run_each(
         ],
         fit == len(rows),
     )
+
+
+def folder_names(scans: Sequence[str]) -> list[str]:
+    """The folder of each subject. Raises SettingError when two bear one name."""
+    names = [Path(path).resolve().name.split(".")[0] for path in scans]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise SettingError(f"two subjects are called {twice[0]}; results are told apart by the name, so rename one", key=twice[0])
+    return names
 
 
 def _made(job: Subjects, scheduler: str | None, reporter: Reporter) -> Iterator[tuple[int, dict[str, Any]]]:

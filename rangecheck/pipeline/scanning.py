@@ -7,11 +7,12 @@ from pathlib import Path
 
 from rangecheck.config import Settings
 from rangecheck.errors import OutputError, PosesRefused
-from rangecheck.pipeline.folder import check_free, check_writable, job_folder, key_of
+from rangecheck.pipeline.folder import check_free, job_folder, key_of
 from rangecheck.pipeline.health import versions
 from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.preparing import prepared
 from rangecheck.pipeline.subject import hashes, read_all_scans, surface_of
+from rangecheck.pipeline.views import refuse_existing
 from rangecheck.progress import Reporter
 from rangecheck.surface import ORIGIN_NAMES
 from rangecheck.surface.topology import boundary_edges
@@ -23,7 +24,7 @@ def mesh(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None
 
     if Path(out).suffix.lower() not in SUFFIXES:
         raise OutputError(out, f"ends in {Path(out).suffix or 'nothing'}; a mesh ends in {', '.join(SUFFIXES)}")
-    check_writable(out)
+    refuse_existing(out, force)
     read = read_all_scans(scans, unit, reporter)
     try:
         ready = prepared(read, settings, reporter)
@@ -35,6 +36,11 @@ def mesh(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None
 
         surface = labelled(surface, ready.refined, ready.scans)
     open_edges = len(boundary_edges(surface.faces))
+    if open_edges and Path(out).suffix.lower() == ".stl":
+        raise OutputError(
+            out, f"STL is for what can be built, and this surface has {open_edges:,} boundary edges; write a .ply, and make a part of it with "
+            "`rangecheck solid`", boundary_edges=open_edges,
+        )  # fmt: skip
     with reporter.stage("writing"):
         write_mesh(surface, out, force=force)
     shares = {name: surface.share_of_area(origin) for origin, name in enumerate(ORIGIN_NAMES)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 from collections.abc import Sequence
 from dataclasses import MISSING, dataclass, fields, replace
@@ -182,8 +183,12 @@ def _number(assignment: str) -> tuple[str, Any]:
     """KEY=VALUE as a field of `RangeFinder`, of its kind."""
     key, equals, text = assignment.partition("=")
     known = {f.name: f.default for f in fields(RangeFinder) if f.default is not MISSING}
-    if not equals or key not in known:
-        raise SettingError(f"finder {assignment!r} is not KEY=VALUE of a range finder; its keys are {', '.join(known)}", key=key)
+    if not equals:
+        raise SettingError(f"--finder takes key=value; got {assignment!r}, for example --finder lost_share=0.1", key=key)
+    if key not in known:
+        near = difflib.get_close_matches(key, known, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"its numbers are {', '.join(known)}"
+        raise SettingError(f"a range finder has no {key!r}; {hint}", key=key)
     kind = type(known[key])
     try:
         return key, tuple(map(float, text.split(","))) if kind is tuple else kind(text)

@@ -87,6 +87,8 @@ def read_all_scans(paths: Sequence[str | Path], unit: str | None, reporter: Repo
 
     scans: list[Measured] = []
     for path in map(Path, paths):
+        if not path.exists():
+            raise InputError(path, "does not exist; check the name")
         if holds_capture(path):
             scans += _enough(path, [decoded(path, reporter).scan])
             continue

@@ -207,6 +207,29 @@ def _nowhere(index: int) -> FloatArray:
     raise AssertionError(f"frame {index} was to be made on the cluster")
 
 
+def check_asked(out: str, materials: Sequence[str], sheet: str | None, settings: Settings, force: bool) -> tuple[str, ...]:
+    """The materials of a turntable, after all that can be refused before its subject is read."""
+    film = Path(out)
+    if film.suffix.lower() not in FORMATS:
+        raise OutputError(out, f"must end in one of {', '.join(FORMATS)}")
+    if sheet is not None and Path(sheet).suffix.lower() != ".png":
+        raise OutputError(sheet, "must end in .png")
+    for target in (out, *([sheet] if sheet else [])):
+        refuse_existing(target, force)
+    find_encoder(film.suffix.lower())
+    if settings.turntable.frame_format == "exr":
+        need_openexr()
+    chosen = tuple(materials) or _chosen(settings)
+    if settings.turntable.show in ("distance", "id"):
+        chosen = chosen[:1]
+    for name in chosen:
+        material = load_material(name)
+        if settings.turntable.show == "stripes":
+            _need_mirror(material)
+    camera_of(settings)
+    return chosen
+
+
 def turntable(
     path: str,
     out: str,
@@ -226,22 +249,7 @@ def turntable(
     Without `materials` it is the first of the settings, for stripes the first that mirrors. `sheet` is a picture of all frames.
     With `consistency` what the turntable shows of the surface is measured and drawn beside the frames; the outcome is its verdict."""
     film = Path(out)
-    if film.suffix.lower() not in FORMATS:
-        raise OutputError(out, f"must end in one of {', '.join(FORMATS)}")
-    if sheet is not None and Path(sheet).suffix.lower() != ".png":
-        raise OutputError(sheet, "must end in .png")
-    for target in (out, *([sheet] if sheet else [])):
-        refuse_existing(target, force)
-    find_encoder(film.suffix.lower())
-    if settings.turntable.frame_format == "exr":
-        need_openexr()
-    chosen = tuple(materials) or _chosen(settings)
-    if settings.turntable.show in ("distance", "id"):
-        chosen = chosen[:1]
-    elif settings.turntable.show == "stripes":
-        for name in chosen:
-            _need_mirror(load_material(name))
-    camera_of(settings)
+    chosen = check_asked(out, materials, sheet, settings, force)
     subject = read_subject(path, settings, unit, reporter)
     folder = Path(frames_dir) if frames_dir else film.with_name(f"{film.stem}-frames")
     made: list[_Made] = []

@@ -10,7 +10,7 @@ import numpy as np
 from rangecheck.animation import Orbit, orbit_around
 from rangecheck.arrays import FloatArray
 from rangecheck.config import Settings
-from rangecheck.errors import InputError, OutputError
+from rangecheck.errors import InputError, OutputError, SceneError
 from rangecheck.export.camera_files import write_camera_json
 from rangecheck.export.map_files import write_chain, write_maps, write_shadows, write_value_map
 from rangecheck.maps import (
@@ -93,6 +93,17 @@ def refuse_existing(path: str | Path, force: bool) -> None:
         raise OutputError(path, "exists already; pass --force to replace it")
 
 
+def _refuse_what_shows_nothing(name: str, measured: Maps) -> None:
+    """Raises SceneError where a focal point sees nothing, or lies on the surface itself."""
+    eye = ", ".join(f"{x:z.1f}" for x in measured.world_from_camera[:3, 3])
+    if not measured.hit.any():
+        raise SceneError(f"nothing of {name} is seen from the focal point ({eye}) mm; say another --camera")
+    if float(np.nanmax(measured.distance_mm)) <= 0.0:
+        raise SceneError(
+            f"the focal point ({eye}) mm lies on the surface of {name}, so no distance is above 0; say another --camera"
+        )
+
+
 def map_at(surface: Surface, settings: Settings, azimuth_deg: float) -> tuple[Maps, str]:
     """Maps from a focal point of its own orbit at `azimuth_deg`, and where that is in words."""
     camera = camera_of(settings)
@@ -133,6 +144,7 @@ def maps(
     with reporter.stage("measuring"):
         caster = EmbreeCaster(surface.vertices, surface.faces)
         measured = trace_maps(surface, camera, pose, caster)
+        _refuse_what_shows_nothing(subject.name, measured)
         chain = trace_chain(surface, measured, caster, bounces=bounces, normals=normals)
         proof = back_projection_error(surface, measured)
         apart = None if other is None else deviation_seen(measured, other.surface)
@@ -213,11 +225,12 @@ def draw(
     if Path(out).suffix.lower() != ".svg":
         raise OutputError(out, "must end in .svg")
     refuse_existing(out, force)
-    subject = read_subject(path, settings, None, reporter)
-    if subject.model is None:
+    if Path(path).suffix.lower() != ".toml":
         raise InputError(
             path, "is no modelled scene; a line drawing needs faces that know their edges, as a scene's .toml file gives them"
         )
+    subject = read_subject(path, settings, None, reporter)
+    assert subject.model is not None
     if settings.picture.camera != "orthographic":
         # lines stay straight in these two alone
         camera_of(settings)

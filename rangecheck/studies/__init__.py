@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -34,7 +35,9 @@ def study_named(name: str, part: str | None = None, others: Sequence[str] = ()) 
     """The function `study(quick=False) -> Study` of that name, or of one of its parts. Raises SettingError naming those that exist, here
     and among `others`, which the caller knows."""
     if name not in STUDIES:
-        raise SettingError(f"there is no study {name!r}; choose one of {', '.join([*STUDIES, *others])}", key=name)
+        near = difflib.get_close_matches(name, [*STUDIES, *others], n=1)
+        hint = f"did you mean {near[0]}?" if near else f"choose one of {', '.join([*STUDIES, *others])}"
+        raise SettingError(f"there is no study {name!r}; {hint}", key=name)
     module = importlib.import_module(STUDIES[name])
     if part is None:
         made: Callable[..., Study] = module.study

@@ -66,7 +66,10 @@ def read_capture(folder: str | Path) -> Capture:
         left, right = (_numbered(folder / name, found, bits) for name, found in zip(("leftCam", "rightCam"), named))
         return Capture(*left, *right, None)
     if not folder.is_dir():
-        raise InputError(folder, "is not a folder of structured-light pictures")
+        said = (
+            "is a file; give the folder of the structured-light pictures" if folder.exists() else "does not exist; check the name"
+        )
+        raise InputError(folder, said)
     below = sorted(p.parent.name for p in folder.glob("*/capture.json"))
     if below:
         raise InputError(folder, f"holds {len(below)} captures in its folders; name them one by one ({', '.join(below[:4])})")
@@ -77,7 +80,7 @@ def read_grey(path: Path) -> Picture:
     """A grey picture (h, w) uint8 or uint16; colours become their luminance (ITU-R 601, as JPEG has it). Raises InputError."""
     import io
 
-    from PIL import Image
+    from PIL import Image, UnidentifiedImageError
 
     content = read_bytes(path)
     try:
@@ -88,6 +91,8 @@ def read_grey(path: Path) -> Picture:
             return np.asarray(picture if picture.mode in ("L", "I;16") else picture.convert("L"))
     except InputError:
         raise
+    except UnidentifiedImageError:
+        raise InputError(path, "is no picture that can be read; JPEG, PNG, BMP and PPM can") from None
     except Exception as error:  # Pillow raises whatever a damaged file leads it to
         raise InputError(path, f"is a damaged picture ({' '.join(str(error).split())[:100]}); copy it again") from None
 
