@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 import sys
+import weakref
 
 import numpy as np
 import pytest
@@ -14,8 +15,9 @@ from test_solid_repair import BALL, ball
 from test_topology import grid, torus
 from test_topology_distance import CUBE_CORNERS, CUBE_FACES, cube
 
+from rangecheck.arrays import float32_spacing_mm
 from rangecheck.config import load_settings
-from rangecheck.errors import SettingError, SurfaceError
+from rangecheck.errors import NotSolid, SettingError, SurfaceError
 from rangecheck.export.meshes import write_mesh
 from rangecheck.export.stl import stl_bytes, write_stl
 from rangecheck.pipeline.shape import make_solid
@@ -23,13 +25,15 @@ from rangecheck.progress import Reporter
 from rangecheck.solid import Solid, close_relief, repair
 from rangecheck.solid.base import trimmed
 from rangecheck.solid.closing import choose_way, close_surface
+from rangecheck.solid.engine import cross_section, from_engine, prism
 from rangecheck.solid.hollow import hollow
 from rangecheck.solid.orientation import advise, judge
+from rangecheck.solid.plane_cut import MOST_STEPS, clear_height_mm, cut_by_plane
 from rangecheck.solid.printer import printer
 from rangecheck.solid.relief_back import hollow_back
 from rangecheck.solid.slicer import weld_findings, welded_within
 from rangecheck.solid.socle import with_socle
-from rangecheck.surface import INVENTED, Surface
+from rangecheck.surface import INVENTED, MEASURED, Surface
 from rangecheck.surface.mesh_files import read_mesh
 from rangecheck.surface.surface import join
 
@@ -64,7 +68,8 @@ def test_the_leash_shrinks_with_the_part():
 
 def test_with_little_memory_a_solid_is_proved_without_manifold3d_and_what_only_that_does_is_refused(monkeypatch):
     monkeypatch.setattr("rangecheck.memory._most_mb", 1.0)
-    made = make_solid(BALL, load_settings(None, (), {"solid.base": "none"}), Reporter())
+    never_judged = Surface(BALL.vertices, BALL.faces)
+    made = make_solid(never_judged, load_settings(None, (), {"solid.base": "none"}), Reporter())
     assert made.solid is not None and "manifold3d" in made.verdict.get("left-out").message
     with pytest.raises(SettingError, match=r"solid.wall_mm, solid.base of .* faces takes about .* MB, and memory_mb leaves 0"):
         make_solid(BALL, load_settings(None, (), {"solid.wall_mm": 2.0}), Reporter())
@@ -79,6 +84,36 @@ def test_a_solid_that_does_not_fit_into_memory_is_refused_in_one_line_before_any
     assert not (tmp_path / "ball.stl").exists()
 
 
+def test_a_large_mesh_is_cut_face_by_face_and_its_file_does_not_depend_on_the_memory(tmp_path, monkeypatch):
+    monkeypatch.setattr("rangecheck.solid.base.FACES_OF_ENGINE", 0)
+    monkeypatch.setattr("rangecheck.pipeline.shape.FACES_OF_ENGINE", 0)
+    write_mesh(BALL, tmp_path / "ball.ply")
+    written = []
+    for engine_takes, name in ((1.0, "ample"), (1e12, "bounded")):
+        monkeypatch.setattr("rangecheck.solid.engine.BYTES_A_FACE", engine_takes)
+        line = ["solid", str(tmp_path / "ball.ply"), "-o", str(tmp_path / f"{name}.stl"), "--memory-mb", "20000"]
+        assert exit_status(line) == 0
+        said = json.loads((tmp_path / f"{name}.stl.json").read_text())
+        assert ("left-out" in {f["code"] for f in said["read_back"]["findings"]}) == (name == "bounded")
+        written.append((tmp_path / f"{name}.stl").read_bytes())
+    assert written[0] == written[1]
+    assert "base" in said["areas"]["parts"]
+
+
+def test_what_a_surface_was_before_it_was_cut_is_held_no_longer(monkeypatch):
+    def cut(*arguments):
+        return trimmed(*arguments[:1], height_mm=0.0)
+
+    given = [Surface(BALL.vertices, BALL.faces)]
+    whole = weakref.ref(given[0])
+    monkeypatch.setattr("rangecheck.pipeline.shape._cut", cut)
+    proving = Solid.from_surface
+    alive = []
+    monkeypatch.setattr(Solid, "from_surface", lambda *args, **more: alive.append(whole()) or proving(*args, **more))
+    made = make_solid(given.pop(), load_settings(None, (), {"solid.base": "none"}), Reporter())
+    assert made.solid is not None and alive == [None]
+
+
 def test_bodies_that_run_into_each_other_are_united_to_their_closed_form():
     apart = 3.0
     both = join([cube(4.0), Surface(cube(4.0).vertices + [apart, 0.5, 0.25], CUBE_FACES)])
@@ -89,11 +124,36 @@ def test_bodies_that_run_into_each_other_are_united_to_their_closed_form():
 
 
 @pytest.mark.parametrize("normal", [(0, 1, 0), (1, 2, -2)])
-def test_a_plane_through_the_middle_of_a_ball_leaves_half_of_it_with_a_cap(normal):
+@pytest.mark.parametrize("face_by_face", [False, True])
+def test_a_plane_through_the_middle_of_a_ball_leaves_half_of_it_with_a_cap(normal, face_by_face, monkeypatch):
+    if face_by_face:
+        monkeypatch.setattr("rangecheck.solid.base.FACES_OF_ENGINE", 0)
     half = trimmed(BALL, height_mm=0.0, up=normal, cap="cut")
     assert half.volume_mm3 == pytest.approx(BALL.volume_mm3 / 2, rel=1e-3)
     cap = half.part_of_face == half.part_names.index("cut")
     assert half.face_areas[cap].sum() == pytest.approx(np.pi * 100, rel=0.01)
+
+
+def test_a_step_that_lies_in_the_cutting_plane_goes_and_what_stands_on_it_keeps_part_and_origin():
+    # an L: 4 wide at the bottom, 1 wide above y = 1
+    ring = np.array([[0, 0], [4, 0], [4, 1], [1, 1], [1, 3], [0, 3]], float)
+    step = from_engine(prism(cross_section([ring], 0.0), 0.0, 2.0), [], "stair", MEASURED)
+    left = Solid.from_surface(cut_by_plane(step, np.array([0.0, 1.0, 0.0]), 1.0, "base"))
+    moved = MOST_STEPS * float32_spacing_mm(4.0)
+    assert 2 * 2 - 2 * moved <= left.volume_mm3 <= 2 * 2
+    cap = left.surface.part_of_face == left.surface.part_names.index("base")
+    assert left.surface.face_areas[cap].sum() == pytest.approx(2.0) and left.surface.face_normals[cap][:, 1].max() < -1 + 1e-12
+    assert (left.surface.origin_of_face[cap] == INVENTED).all() and (left.surface.origin_of_face[~cap] == MEASURED).all()
+    with pytest.raises(NotSolid, match="not closed where the plane cuts it"):
+        cut_by_plane(step.with_faces(np.arange(len(step.faces)) != 0), np.array([0.3, 0.9, 0.3]), 2.0, "base")
+
+
+def test_a_plane_keeps_clear_of_vertices_near_it():
+    assert clear_height_mm(np.array([0.0, 5.0]), 2.0, 1e-3) == 2.0
+    near = np.array([0.0, 2.0 - 4e-3, 2.0, 2.0 + 1e-3, 5.0])
+    assert clear_height_mm(near, 2.0, 1e-3) == pytest.approx(2.0 + 33e-3)
+    crowded = 2.0 + np.arange(-100, 3000) * 1e-3
+    assert np.abs(crowded - clear_height_mm(crowded, 2.0, 1e-3)).min() == pytest.approx(0.5e-3)
 
 
 def test_a_socle_carries_the_bust_and_a_nameplate_only_where_asked():

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from rangecheck.arrays import FloatArray
 from rangecheck.errors import NotSolid
 from rangecheck.files import whole_file
 from rangecheck.solid.findings import Verdict
@@ -69,13 +70,14 @@ def write_stl(
     rounded, moved = as_float32(surface)
     if isinstance(solid, Solid):
         rounded = collapse_flat_faces(rounded)
-    with (
-        proved_file(path, force=force, must_be_solid=not force_open, severities=severities) as (part, judged),
-        part.open("wb") as stream,
-    ):
-        for piece in _pieces(rounded, ascii, lowered):
-            stream.write(piece)
-    return Exported(Path(path), len(rounded.faces), judged.verdict, moved, judged.surface, lowered)
+    count = len(rounded.faces)
+    with proved_file(path, force=force, must_be_solid=not force_open, severities=severities) as (part, judged):
+        with part.open("wb") as stream:
+            for piece in _pieces(rounded, ascii, lowered):
+                stream.write(piece)
+        # what is read back takes their place
+        del rounded, surface
+    return Exported(Path(path), count, judged.verdict, moved, judged.surface, lowered)
 
 
 def stl_bytes(surface: Surface, *, ascii: bool = False) -> bytes:
@@ -125,13 +127,17 @@ def proved_file(
 def as_float32(surface: Surface) -> tuple[Surface, float]:
     """`surface` with its coordinates rounded to float32, and the farthest that moved a vertex."""
     rounded = surface.vertices.astype(np.float32).astype(np.float64)
-    moved = float(np.abs(rounded - surface.vertices).max(initial=0.0))
+    moved = max((float(np.abs(new - old).max()) for new, old in _in_rows(rounded, surface.vertices)), default=0.0)
     return (
         Surface(
             rounded, surface.faces, surface.part_of_face, surface.origin_of_face, surface.part_names, surface.vertex_error_mm
         ),
         moved,
     )
+
+
+def _in_rows(*arrays: FloatArray) -> Iterator[tuple[FloatArray, ...]]:
+    return (tuple(a[first : first + (1 << 20)] for a in arrays) for first in range(0, len(arrays[0]), 1 << 20))
 
 
 def _records(surface: Surface, faces: slice) -> npt.NDArray[np.void]:

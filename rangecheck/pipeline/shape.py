@@ -20,19 +20,23 @@ from rangecheck.pipeline.subject import eye_of, hashes, read_subject
 from rangecheck.progress import Reporter
 from rangecheck.rigid import inverse
 from rangecheck.solid import Solid, Verdict, check_solid, choose_base_height, untangle, verdict
-from rangecheck.solid.base import UP, trimmed
+from rangecheck.solid.base import FACES_OF_ENGINE, UP, trimmed
 from rangecheck.solid.closing import Closed, choose_way, close_surface
 from rangecheck.solid.engine import needed_mb
 from rangecheck.solid.hollow import Hollow, hollow
 from rangecheck.surface import ORIGIN_NAMES, Surface
+from rangecheck.surface.edges import forget_edges
+from rangecheck.surface.intersections import FACES_OF_BLOCK
 from rangecheck.surface.standing import file_from_scans
+from rangecheck.surface.tree import forget_tree
 
 if TYPE_CHECKING:
     from rangecheck.export.stl import Exported
 
 
-#: what proving, writing and reading back takes of a face beside the surface itself (measured at 2e6 faces: 520), without manifold3d
-BYTES_A_FACE = 540
+#: what proving, writing and reading back takes of a face beside the surface itself, without manifold3d (measured at 2e7 faces: 152); of few, whose
+#: faces are looked at all at once for crossings, it is more
+BYTES_A_FACE, BYTES_OF_FEW = 155, 300
 
 
 @dataclass
@@ -65,10 +69,15 @@ def make_solid(surface: Surface, settings: Settings, reporter: Reporter, eye_mm:
     made = Made(None, closed.after, closed.surface, closed)
     if not _can_go_on(closed.after):
         return made
+    del surface
     try:
         with reporter.stage("base"):
             shaped = _based(_cut(closed.surface, wanted, reporter), wanted, reporter)
             shaped = _scaled(shaped, wanted.height_mm, reporter) if wanted.height_mm is not None else shaped
+        if shaped is not closed.surface:
+            # what it was before is asked for no more, and is held no longer
+            made.closed = closed = replace(closed, surface=shaped, solid=None)
+            made.surface = shaped
         if wanted.simplify_mm is not None:
             with reporter.stage("simplifying"):
                 shaped = _simplified(shaped, made, wanted, reporter)
@@ -91,12 +100,14 @@ def _refuse_what_has_no_room(surface: Surface, wanted: Solidify, eye_mm: FloatAr
     takes, left = needed_mb(len(surface.faces)), memory.left_mb()
     if takes <= left:
         return
+    by_engine = len(surface.faces) <= FACES_OF_ENGINE
+    bases = {"auto": by_engine, "socle": True, "none": False}
     steps = {
-        "solid.cut": wanted.cut is not None,
-        "solid.base_height_mm": wanted.base_height_mm is not None,
+        "solid.cut": wanted.cut is not None and by_engine,
+        "solid.base_height_mm": wanted.base_height_mm is not None and by_engine,
         "solid.simplify_mm": wanted.simplify_mm is not None,
         "solid.wall_mm": wanted.wall_mm is not None,
-        "solid.base": wanted.base != "none" and choose_way(surface, one_scan=eye_mm is not None)[0] != "relief",
+        "solid.base": bases[wanted.base] and choose_way(surface, one_scan=eye_mm is not None)[0] != "relief",
     }
     named = [key for key, is_asked in steps.items() if is_asked]
     if named:
@@ -270,15 +281,7 @@ def solid(
         if target.exists() and not force:
             raise OutputError(target, "exists already; pass --force to replace it")
     printer_of(settings.solid)
-    subject = read_subject(path, settings, unit, reporter)
-    takes, left = BYTES_A_FACE * len(subject.surface.faces) / 1e6, memory.left_mb()
-    if takes > left:
-        raise SettingError(
-            f"a solid of {len(subject.surface.faces):,} faces takes about {takes:,.0f} MB to prove, write and read back, and memory_mb leaves "
-            f"{left:,.0f}; raise it, or begin with a coarser mesh (rangecheck check still judges this one)",
-            key="memory_mb",
-        )
-    made = make_solid(subject.surface, settings, reporter, eye_of(subject.scans))
+    made = _made_of(path, unit, settings, reporter)
     lines, said = _story(made)
     lines += made.verdict.lines()
     shares = {"parts": _areas(made.surface), "origins": {n: made.surface.share_of_area(k) for k, n in enumerate(ORIGIN_NAMES)}}
@@ -293,6 +296,8 @@ def solid(
         )
     with reporter.stage("exporting"):
         part = made.solid or made.surface
+        forget_edges(made.surface)
+        forget_tree(made.surface)
         stand = settings.solid.file_up == "z"
         written = write_mesh(
             part, out, force=force, force_open=force_open, ascii=ascii, stand=stand, severities=settings.checking.severities
@@ -300,6 +305,7 @@ def solid(
         plugs = _write_plugs(made, out, force, stand)
     fit = made.solid is not None
     if made.solid is not None and written is not None:
+        forget_edges(written.read_back)
         near = weld_findings(written.read_back, severities=settings.checking.severities)
         reread = verdict([*written.verdict.findings, *near], written.verdict.facts)
         content["read_back"] = reread.to_dict() | {
@@ -330,6 +336,22 @@ def solid(
             Path(one).unlink(missing_ok=True)
         raise
     return Outcome(content, [*lines, f"{beside}: what it was made of, and how"], fit)
+
+
+def _made_of(path: str, unit: str | None, settings: Settings, reporter: Reporter) -> Made:
+    subject = read_subject(path, settings, unit, reporter)
+    count = len(subject.surface.faces)
+    takes, left = max(BYTES_A_FACE * count, BYTES_OF_FEW * min(count, FACES_OF_BLOCK)) / 1e6, memory.left_mb()
+    if takes > left:
+        raise SettingError(
+            f"a solid of {count:,} faces takes about {takes:,.0f} MB to prove, write and read back, and memory_mb leaves "
+            f"{left:,.0f}; raise it, or begin with a coarser mesh (rangecheck check still judges this one)",
+            key="memory_mb",
+        )
+    eye, surface = eye_of(subject.scans), [subject.surface]
+    del subject
+    # handed over: once it is cut it is held nowhere
+    return make_solid(surface.pop(), settings, reporter, eye)
 
 
 def _story(made: Made) -> tuple[list[str], dict[str, Any]]:

@@ -1,6 +1,7 @@
 """Cutting a solid by a plane, and choosing where a bust is cut flat to stand.
 
 The plane's cap is of part "base" and invented; all other faces keep part and origin, and where the plane does not pass, their vertices.
+Large surfaces are cut face by face (plane_cut.py), all others by manifold3d, which takes 480 bytes a face.
 """
 
 from __future__ import annotations
@@ -13,10 +14,13 @@ import numpy.typing as npt
 from rangecheck.arrays import FloatArray, require
 from rangecheck.errors import SurfaceError
 from rangecheck.solid.engine import from_engine, to_engine
+from rangecheck.solid.plane_cut import cut_by_plane
 from rangecheck.solid.solid import Solid
 from rangecheck.surface.surface import INVENTED, Surface
 
 UP = (0.0, 1.0, 0.0)
+#: more faces than this are cut without manifold3d, however much memory there is
+FACES_OF_ENGINE = 1 << 22
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,8 @@ def trimmed(whole: Surface, *, height_mm: float, up: npt.ArrayLike = UP, cap: st
             low_mm=low,
             high_mm=high,
         )
+    if len(whole.faces) > FACES_OF_ENGINE:
+        return cut_by_plane(whole, normal, height_mm, cap)
     engine, number = to_engine(whole)
     return from_engine(engine.trim_by_plane(tuple(normal), float(height_mm)), [(number, whole)], cap)
 

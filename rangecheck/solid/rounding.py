@@ -21,13 +21,7 @@ def collapse_flat_faces(surface: Surface) -> Surface:
     """`surface` with equal vertices welded, faces closed to lines left out, and faces without area given some by turning diagonals.
 
     No vertex moves. What cannot be mended so is left for the check to name."""
-    first, number = weld_exactly(surface.vertices)
-    faces = number[surface.faces]
-    keep = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    error = None if surface.vertex_error_mm is None else surface.vertex_error_mm[first]
-    welded = Surface(
-        surface.vertices[first], faces[keep], surface.part_of_face[keep], surface.origin_of_face[keep], surface.part_names, error
-    )
+    welded = _welded(surface)
     for _ in range(8):
         flat = topo.degenerate_faces(welded)
         if not len(flat):
@@ -37,6 +31,19 @@ def collapse_flat_faces(surface: Surface) -> Surface:
             break
         welded = replace(welded, faces=turned)
     return welded
+
+
+def _welded(surface: Surface) -> Surface:
+    first, number = weld_exactly(surface.vertices)
+    # where all are different they were numbered as they are
+    faces = number[surface.faces] if len(first) < len(number) else surface.faces
+    keep = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    if len(first) == len(number) and keep.all():
+        return replace(surface, refined_of_face=None)
+    error = None if surface.vertex_error_mm is None else surface.vertex_error_mm[first]
+    return Surface(
+        surface.vertices[first], faces[keep], surface.part_of_face[keep], surface.origin_of_face[keep], surface.part_names, error
+    )
 
 
 def _turned_diagonals(surface: Surface, flat: IntArray) -> IntArray | None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
+from weakref import WeakKeyDictionary
 
 from rangecheck import memory
 from rangecheck.errors import NotSolid
@@ -19,6 +20,8 @@ from rangecheck.surface import topology as topo
 from rangecheck.surface.surface import Surface
 
 _PROOF = object()
+#: whole checks with the severities of the catalogue, kept as long as their surface lives
+_verdicts: WeakKeyDictionary[Surface, Verdict] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +88,18 @@ def check_solid(
     """Everything that keeps `surface` from being the boundary of a solid, with places, and what was measured.
 
     `intersections` and `engine` leave out the two slower checks (the verdict's facts say so); `severities` overrides the default
-    severity of findings by code. Raises nothing: a surface without faces has the finding no-volume."""
+    severity of findings by code. Raises nothing: a surface without faces has the finding no-volume. A whole check with the default severities
+    is made once of each surface."""
+    whole = intersections and engine and not severities
+    if not whole:
+        return _checked(surface, intersections, engine, severities)
+    known = _verdicts.get(surface)
+    if known is None:
+        known = _verdicts[surface] = _checked(surface, True, True, None)
+    return known
+
+
+def _checked(surface: Surface, intersections: bool, engine: bool, severities: Mapping[str, str] | None) -> Verdict:
     found: list[Finding] = []
     closed = topo.is_closed(surface)
     low, high = surface.bounds_mm

@@ -37,6 +37,7 @@ _ATTRIBUTE = re.compile(rb"([\w:]+)\s*=\s*([\"'])(.*?)\2")
 FORMATS = ("stl", "ply", "obj", "off", "glb", "3mf")
 #: float32, in which STL is written and rays are traced, holds squares of lengths up to 1.8e19 mm
 LARGEST_MM = 1e18
+_AT_ONCE = 1 << 20
 #: 3MF's names of units
 _UNITS_3MF = {"micron": "um", "millimeter": "mm", "centimeter": "cm", "meter": "m", "inch": "in"}
 
@@ -63,18 +64,19 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Surface:
 def open_mesh(path: str | Path, unit: str | None = None) -> MeshFile:
     """As `read_mesh`, with what was found out about the file."""
     path = Path(path)
-    content = read_bytes(path)
-    kind = _format(path, content)
+    kind = _format(path, read_bytes(path, 8))
+    content = b"" if kind == "stl" else read_bytes(path)
     notes: list[str] = []
     records = False
     vertices: FloatArray
     faces: IntArray
     labels: Labels | None = None
     if kind == "stl":
-        corners, notes, records = stl_corners(path, content)
+        corners, notes, records = stl_corners(path)
         _finite(path, corners.reshape(-1, 3), 3)
         first, number = weld_exactly(corners.reshape(-1, 3))
         vertices, faces = corners.reshape(-1, 3)[first].astype(np.float64), number.reshape(-1, 3)
+        del corners
         notes.append(f"{len(number)} corners were welded to {len(first)} vertices where their float32 coordinates are equal")
     elif kind == "ply":
         vertices, faces, notes, said, labels = ply_mesh(path, content)
@@ -100,14 +102,14 @@ def open_mesh(path: str | Path, unit: str | None = None) -> MeshFile:
         vertices, faces = _welded(vertices, faces, notes)
         if labels is not None and len(vertices) < before:
             labels = labels._replace(error_mm=None)
-    farthest = float(np.abs(vertices).max()) * mm_per(unit)
+    farthest = float(max(vertices.max(), -vertices.min())) * mm_per(unit)
     if farthest > LARGEST_MM:
         raise InputError(
             path,
             f"has coordinates up to {farthest:.3g} mm, beyond the {LARGEST_MM:g} mm that can be reckoned with; say its unit with --unit",
         )
     own = vertices
-    lowered = lowered_in(_head(content, kind))
+    lowered = lowered_in(read_bytes(path, 80) if kind == "stl" else _head(content, kind))
     del content
     if lowered is not None:
         vertices = turned_back(vertices, lowered)
@@ -123,8 +125,6 @@ def open_mesh(path: str | Path, unit: str | None = None) -> MeshFile:
 
 def _head(content: bytes, kind: str) -> bytes:
     """Where a file for slicers says how it stands."""
-    if kind == "stl":
-        return content[:80]
     if kind != "3mf":
         return b""
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -147,9 +147,9 @@ def _format(path: Path, content: bytes) -> str:
 
 
 def _finite(path: Path, vertices: FloatArray, per_face: int) -> None:
-    finite = np.isfinite(vertices)
-    if not finite.all():
-        bad = np.flatnonzero(~finite.all(axis=1))
+    # piece by piece: what is said of each of a large file is much
+    if not all(np.isfinite(vertices[first : first + _AT_ONCE]).all() for first in range(0, len(vertices), _AT_ONCE)):
+        bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
         where = f"{len(np.unique(bad // 3))} faces have corners" if per_face == 3 else f"{len(bad)} vertices have coordinates"
         name = "face" if per_face == 3 else "vertex"
         raise InputError(

@@ -84,7 +84,10 @@ class Surface:
     @cached_property
     def face_areas(self) -> FloatArray:
         """(m,) mm^2."""
-        return np.linalg.norm(self.area_vectors, axis=1)
+        areas = np.empty(len(self.faces))
+        for piece in self.pieces():
+            areas[piece] = np.linalg.norm(self.area_vectors_of(piece), axis=1)
+        return areas
 
     @cached_property
     def face_normals(self) -> FloatArray:
@@ -113,10 +116,16 @@ class Surface:
         """(k, 3) `face_normals` of some faces; those of all are not kept for it."""
         if "face_normals" in self.__dict__:
             return self.face_normals[chosen]
+        return unit_vectors(self.area_vectors_of(chosen))
+
+    def area_vectors_of(self, chosen: slice | IntArray) -> FloatArray:
+        """(k, 3) `area_vectors` of some faces; those of all are not kept for it."""
+        if "area_vectors" in self.__dict__:
+            return self.area_vectors[chosen]
         faces = self.faces[chosen]
         vectors = np.empty((len(faces), 3))
         area_vectors_into(self.vertices, faces, vectors)
-        return unit_vectors(vectors)
+        return vectors
 
     @property
     def area_mm2(self) -> float:

@@ -56,6 +56,11 @@ def triangle_tree(surface: Surface) -> TriangleTree:
     return tree
 
 
+def forget_tree(surface: Surface) -> None:
+    """Keep the tree of a surface no longer: of a large mesh it is more than the mesh."""
+    _trees.pop(surface, None)
+
+
 def _build(surface: Surface) -> TriangleTree:
     if len(surface.faces) == 0:
         raise SurfaceError("the surface has no faces; there is nothing to measure against")
