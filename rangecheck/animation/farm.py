@@ -27,6 +27,8 @@ from rangecheck.errors import DependencyMissing, RangecheckError
 AHEAD = 2
 #: a frame whose worker was lost this many times is given up: the frame itself kills workers
 LOST_WORKERS = 4
+#: workers that were lost are waited for at least so long: those that look after them start new ones, which takes ten seconds on two busy cores
+RESTART_S = 60.0
 
 J = TypeVar("J")
 T = TypeVar("T")
@@ -121,7 +123,7 @@ class Farm:
                     if lost[index] >= LOST_WORKERS:
                         raise self._given_up(index, error) from None
                     if held is sent:
-                        sent = self._sent(job)
+                        sent = self._sent(job, again=True)
                     ready.add(ask(index))
                     continue
                 except KilledWorker as error:
@@ -133,12 +135,12 @@ class Farm:
 
         return frames
 
-    def _sent(self, job: J) -> Any:
+    def _sent(self, job: J, *, again: bool = False) -> Any:
         """The job on one worker, from which each other fetches it once when its first frame is asked for; workers may be lost while it
         travels. Not on all at once: while it replicates what is scattered, the scheduler tries a lost worker for ever
         (distributed 2026.8)."""
         for attempt in range(LOST_WORKERS):
-            self._need_workers()
+            self._need_workers(max(self.timeout_s, RESTART_S) if again or attempt else self.timeout_s)
             try:
                 return self.client.scatter(job, hash=False)
             except (OSError, TimeoutError) as error:
@@ -154,10 +156,10 @@ class Farm:
             "their logs, then run again: finished frames are kept"
         )
 
-    def _need_workers(self) -> None:
+    def _need_workers(self, timeout_s: float) -> None:
         """Workers that were started a moment ago are waited for."""
         try:
-            self.client.wait_for_workers(1, timeout=self.timeout_s)
+            self.client.wait_for_workers(1, timeout=timeout_s)
         except TimeoutError:
             raise RangecheckError(
                 f"the scheduler at {self.address} has no workers; start some with `dask worker {self.address}`"
