@@ -35,7 +35,7 @@ from .common import Point, common, settings_from
     "--find",
     multiple=True,
     type=click.Choice(["pose", "exposure", "strength", "distance", "radius", "ambient"]),
-    help="Also find these; may be given several times. pose: the camera's, from --camera on, by small steps; exposure: of each picture but "
+    help="Also find these; may be given several times. pose: the camera's, near --camera, by turns of a degree or so and shifts of some per cent of the object's size; exposure: of each picture but "
     "the first; strength: irradiance of each lamp but the first; distance, radius: of each lamp; ambient: light from all around.",
 )
 @click.option(

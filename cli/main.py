@@ -84,6 +84,8 @@ def cli() -> None:
 
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Run the command line and exit."""
+    # threads come from one place, and BLAS's own would wait for each other over small matrices, for a hundred times as long on a machine that is busy
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     sys.exit(exit_status(arguments))
 
 

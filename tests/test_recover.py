@@ -69,13 +69,15 @@ def bumpy_ball():
     return replace(surface, vertices=surface.vertices * wave[:, None])
 
 
-def test_the_pose_s_derivative_is_the_change_of_the_picture_where_the_same_triangle_is_seen():
+@pytest.mark.parametrize("pivot", [None, (5.0, -3.0, 2.0)], ids=["about the camera", "about a pivot"])
+def test_the_pose_s_derivative_is_the_change_of_the_picture_where_the_same_triangle_is_seen(pivot):
     scene = Scene(bumpy_ball(), (Material("grey", K_lm=0.5, wavelengths_um=(0.555,)),), smooth=True)
     camera, pose = PinholeCamera.from_field_of_view(40, 40, 12.0), rigid.look_at((100, 80, 500.0), (0, 0, 0))
     lights = (Light(np.array([0.5, 0.6, 0.7]), 2.0, np.zeros(3), 400.0, 4.0),)
     guess = Guess(0.4, 0.0, 0.3, 0.2, 3.0)
     unknowns = Unknowns((), direction=False, pose=True)
-    start = see(scene, camera, pose)
+    middle = None if pivot is None else np.array(pivot)
+    start = see(scene, camera, pose, pivot_mm=middle)
     slopes = problem_on(start, lights, guess, unknowns).predict(np.zeros(6), 0).slopes
     for k in range(6):
         step = 4e-6 if k < 3 else 1.2e-3
@@ -83,7 +85,10 @@ def test_the_pose_s_derivative_is_the_change_of_the_picture_where_the_same_trian
         for times in (-2, -1, 1, 2):
             moved = pose.copy()
             if k < 3:
-                moved[:3, :3] = rigid.about_axis(np.eye(3)[k], times * step)[:3, :3] @ pose[:3, :3]
+                turn = rigid.about_axis(np.eye(3)[k], times * step)[:3, :3]
+                moved[:3, :3] = turn @ pose[:3, :3]
+                if middle is not None:
+                    moved[:3, 3] = middle + turn @ (pose[:3, 3] - middle)
             else:
                 moved[k - 3, 3] += times * step
             sight = see(scene, camera, moved)

@@ -271,7 +271,8 @@ def _documents() -> dict[str, tuple[Any, ...]]:
         "fit": (
             "`fit` of a material to photographs",
             record(output=TEXT, estimates=many(fields_of(Estimate)), lights=many(POINT), not_determined=TEXTS, residual_in_noises=NUMBER,
-                   rms=NUMBER, outliers=NUMBER, converged=FLAG, inputs=NAMES, seconds=NUMBERS, world_from_camera=or_null(POSE)),
+                   rms=NUMBER, outliers=NUMBER, converged=FLAG, inputs=NAMES, seconds=NUMBERS, world_from_camera=or_null(POSE),
+                   camera_within_mm=or_null(POINT), camera_turn_within_deg=or_null(NUMBER)),
         ),
         "lights": (
             "`fit --calibrate`",

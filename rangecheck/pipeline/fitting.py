@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,18 +20,15 @@ from rangecheck.progress import Reporter
 from rangecheck.raycast import EmbreeCaster
 from rangecheck.recover.fit import Fitted
 from rangecheck.recover.lights import ONE_NODE, SEVEN_NODES, Light
-from rangecheck.recover.problem import Guess, Photograph, Problem, Unknowns
-from rangecheck.recover.sight import Sight, lit_by, see, sphere_sight
+from rangecheck.recover.looks import CameraFound, Look, facing, fit_looking, photographs
+from rangecheck.recover.problem import Guess, Problem, Unknowns
+from rangecheck.recover.sight import Sight, sphere_sight
 from rangecheck.reflectance import Material
 from rangecheck.scene import Scene
 
-#: cosines below which a pixel is left out: grazing views, where the model's bound and the shape's own errors count
-_LEAST_COSINE = 0.3
 _FAR = 1e4
-#: a distance that is looked for begins at this many sizes of the object;  looks at the surface anew while a pose is found
-_NEAR, _LOOKS = 5.0, 4
-#: a camera that moved less than this, as share of the object's size and rad, has settled
-_STILL = 1e-4
+#: a distance that is looked for begins at this many sizes of the object
+_NEAR = 5.0
 _UNITS = {"radius": " degrees", "distance": " mm", "sigma_um": " um", "correlation_um": " um"}
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm")
 
@@ -69,12 +65,12 @@ def fit(
     shape = (values[0].shape[0], values[0].shape[1])
     if "pose" in find and sphere is not None:
         raise SettingError("a sphere's outline is its pose; --find pose is for --on MESH", key="find")
-    look: _Look | None = None
+    look: Look | None = None
     if sphere is not None:
-        sight = _facing(sphere_sight(sphere[:2], sphere[2], shape))
+        sight = facing(sphere_sight(sphere[:2], sphere[2], shape))
     else:
-        look = _look(str(model), shape, camera_mm, field_deg, settings, unit, reporter)
-        sight = _facing(look.see())
+        look = _look(str(model), values, noise, camera_mm, field_deg, settings, unit, reporter)
+        sight = look.see()
     middle, size = sight.points.mean(axis=0), max(float(np.ptp(sight.points, axis=0).max()), 1e-6)
     distance = lamp_distance_mm or size * (_NEAR if "distance" in find else _FAR)
     begun = given if given is not None else _first_directions(sight, values)
@@ -85,71 +81,59 @@ def fit(
     free = {"strength": "irradiance"}
     unknowns = Unknowns(names, one_camera=True, **{free.get(name, name): True for name in find})
     nodes = SEVEN_NODES if "radius" in find else ONE_NODE
-    problem = Problem(_photographs(sight, values, lamps, noise, look), lamps, Guess(), unknowns, nodes)
+    taken = photographs(sight, values, lamps, noise, None if look is None else look.caster)
+    problem = Problem(taken, lamps, Guess(), unknowns, nodes)
     from rangecheck.recover.fit import fit as solve
 
     with reporter.stage("fitting"):
-        fitted = solve(problem, known_noise=False)
-        if look is not None:
-            for _ in range(_LOOKS):
-                # what a pixel sees of the surface changes with the pose, shadows with the lamps
-                moved = look.moved(fitted)
-                state = fitted.problem
-                sight = _facing(look.see())
-                taken = _photographs(sight, values, state.lights, noise, look)
-                photos = tuple(replace(t, exposure=p.exposure, ambient=p.ambient) for t, p in zip(taken, state.photographs))
-                fitted = solve(
-                    replace(problem, photographs=photos, lights=state.lights, material=state.material), known_noise=False
-                )
-                if "pose" not in find or moved < _STILL * size:
-                    break
-            look.moved(fitted)
-    return _told(fitted, out, pictures, force, reporter, look, find)
-
-
-def _facing(sight: Sight) -> Sight:
-    return sight.only((sight.normals * sight.views).sum(1) > _LEAST_COSINE)
-
-
-def _photographs(
-    sight: Sight, values: Sequence[FloatArray], lamps: Sequence[Light], noise: float, look: _Look | None
-) -> tuple[Photograph, ...]:
-    photos = []
-    for k, picture in enumerate(values):
-        seen = picture.reshape(-1)[sight.pixel]
-        lit = np.ones((len(sight), 1), bool) if look is None else lit_by(sight, (lamps[k],), look.caster)
-        photos.append(Photograph(sight, seen, np.full(len(seen), noise), lit, (k,)))
-    return tuple(photos)
+        if look is None:
+            return _told(solve(problem, known_noise=False), out, pictures, force, reporter, None)
+        fitted, found = fit_looking(problem, look)
+    return _told(fitted, out, pictures, force, reporter, found)
 
 
 def _told(
-    fitted: Fitted, out: str, pictures: Sequence[str], force: bool, reporter: Reporter, look: _Look | None, find: Sequence[str]
+    fitted: Fitted, out: str, pictures: Sequence[str], force: bool, reporter: Reporter, camera: CameraFound | None
 ) -> Outcome:
     from rangecheck.recover.outcome import material_of, material_toml
 
-    material = material_of(fitted, Path(out).stem)
+    material, assumed = material_of(fitted, Path(out).stem)
     names = ", ".join(Path(p).name for p in pictures)
     write_bytes(out, material_toml(material, fitted, f"fitted to {names}").encode(), force=force)
     lines = [f"{out}: residuals are {fitted.scale:.2f} times the noise, {100 * fitted.outliers:.1f} % of the pixels are outliers"]
-    lines += [
-        _line(e.name, e.value, e.low, e.high)
-        for e in fitted.estimates
-        if "direction" not in e.name and not e.name.startswith("camera")
-    ]
+    # the camera's pose is told as a whole: its numbers count from the last look
+    estimates = [e for e in fitted.estimates if not e.name.startswith("camera")]
+    lines += [_line(e.name, e.value, e.low, e.high) for e in estimates if "direction" not in e.name]
     lamps = [light.direction for light in fitted.problem.lights]
     lines += [f"  light {k}: towards {_three(d)}{_within(fitted, k)}" for k, d in enumerate(lamps)]
-    pose = None if look is None or "pose" not in find else look.pose
-    if pose is not None:
-        lines.append(f"  camera: at {_three(pose[:3, 3], 2)} mm, looking along {_three(pose[:3, 2])}")
+    if camera is not None:
+        lines += _camera_lines(camera)
+    lines += assumed
     lines += [f"not determined: {said}" for said in fitted.statements]
     if not fitted.converged:
         lines.append("the fit did not settle; give better guesses of the lights, or more pictures")
     content = document(
-        "fit", output=out, estimates=[vars(e) for e in fitted.estimates], lights=lamps, not_determined=fitted.statements,
-        world_from_camera=pose, residual_in_noises=fitted.scale, rms=fitted.rms, outliers=fitted.outliers, converged=fitted.converged,
+        "fit", output=out, estimates=[vars(e) for e in estimates], lights=lamps, not_determined=fitted.statements,
+        world_from_camera=None if camera is None else camera.world_from_camera,
+        camera_within_mm=None if camera is None else camera.within_mm,
+        camera_turn_within_deg=None if camera is None or camera.turn_within_rad is None else math.degrees(camera.turn_within_rad), residual_in_noises=fitted.scale, rms=fitted.rms, outliers=fitted.outliers, converged=fitted.converged,
         inputs=hashes(list(pictures)), seconds=reporter.seconds,
     )  # fmt: skip
     return Outcome(content, lines)
+
+
+def _camera_lines(camera: CameraFound) -> list[str]:
+    pose = camera.world_from_camera
+    place = "not determined" if camera.within_mm is None else f"each within {_three(camera.within_mm, 2)} mm (95 %)"
+    turn = (
+        "not determined"
+        if camera.turn_within_rad is None
+        else f"any way within {math.degrees(camera.turn_within_rad):.2g} degrees (95 %)"
+    )
+    return [
+        f"  camera: at {_three(pose[:3, 3], 2)} mm, {place}",
+        f"    looking along {_three(pose[:3, 2])}, turned {turn}",
+    ]
 
 
 def _line(name: str, value: float, low: float | None, high: float | None) -> str:
@@ -200,42 +184,16 @@ def _first_directions(sight: Sight, values: Sequence[FloatArray]) -> FloatArray:
     return np.array([f / max(float(np.linalg.norm(f)), 1e-12) for f in found])
 
 
-@dataclass
-class _Look:
-    """A camera that looks at a surface: what it sees, from a pose that a fit may move."""
-
-    scene: Scene
-    caster: EmbreeCaster
-    camera: PinholeCamera
-    pose: FloatArray
-
-    def see(self) -> Sight:
-        return see(self.scene, self.camera, self.pose, self.caster)
-
-    def moved(self, fitted: Fitted) -> float:
-        """Move the pose by the turn and shift that a fit found; how far, mm, a point as far away as the camera's middle is moved at most."""
-        found = np.zeros(6)
-        for p, value in zip(fitted.parameters, fitted.theta):
-            if p.kind == "pose":
-                found[p.number] = value
-        angle = float(np.linalg.norm(found[:3]))
-        if angle > 0.0:
-            self.pose[:3, :3] = rigid.about_axis(found[:3] / angle, angle)[:3, :3] @ self.pose[:3, :3]
-        self.pose[:3, 3] += found[3:]
-        away = float(np.linalg.norm(self.pose[:3, 3] - self.scene.surface.bounds_mm.mean(axis=0)))
-        return angle * away + float(np.linalg.norm(found[3:]))
-
-
 def _look(
-    model: str, shape: tuple[int, int], camera_mm: tuple[float, ...] | None, field_deg: float, settings: Any, unit: str | None, reporter: Reporter
-) -> _Look:  # fmt: skip
+    model: str, values: Sequence[FloatArray], noise: float, camera_mm: tuple[float, ...] | None, field_deg: float, settings: Any, unit: str | None, reporter: Reporter
+) -> Look:  # fmt: skip
     if camera_mm is None:
         raise SettingError("say where the camera stood: --camera X,Y,Z in mm; it looks at the middle of the object", key="camera")
     surface = read_subject(model, settings, unit, reporter).surface
     scene = Scene(surface, (Material("grey", K_lm=0.5, wavelengths_um=(0.555,)),), smooth=True)
-    camera = PinholeCamera.from_field_of_view(shape[1], shape[0], field_deg)
+    camera = PinholeCamera.from_field_of_view(values[0].shape[1], values[0].shape[0], field_deg)
     pose = np.array(rigid.look_at(camera_mm, surface.bounds_mm.mean(axis=0)))
-    return _Look(scene, EmbreeCaster(surface.vertices, surface.faces), camera, pose)
+    return Look(scene, EmbreeCaster(surface.vertices, surface.faces), camera, pose, values, noise)
 
 
 def _refuse_beside(sphere: tuple[float, float, float], width: int, height: int) -> None:

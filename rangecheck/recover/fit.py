@@ -19,7 +19,7 @@ from rangecheck.recover.polish import TWO_SIDED_95, Estimate, Fitted, polish
 from rangecheck.recover.problem import Photograph, Problem
 from rangecheck.recover.starts import cheapest, families, solve, thin
 
-__all__ = ["TWO_SIDED_95", "Estimate", "Fitted", "fit"]
+__all__ = ["TWO_SIDED_95", "Estimate", "Fitted", "explored", "fit", "followed", "settled"]
 
 #: how much more (minus log likelihood) an end on a few pixels may cost to be tried on all, and one on all to count as good as the best
 _RIVAL, _AS_GOOD = 12.0, 1.9208
@@ -38,6 +38,13 @@ def fit(
     """Fit the problem's unknowns. `starts` are states to begin from beside those made here; `pixels` of all pictures serve the starts.
 
     With `known_noise` False the intervals are widened by the residuals' own scale. Raises SceneError without pixels or unknowns."""
+    return settled(problem, explored(problem, starts=starts, pixels=pixels, finalists=finalists), known_noise=known_noise)
+
+
+def explored(
+    problem: Problem, *, starts: Sequence[Problem] | None = None, pixels: int = 2500, finalists: int = 4
+) -> list[Problem]:
+    """States on a few pixels where all starts end, the best first: those that could be the best on all."""
     parameters = problem.parameters()
     count = sum(len(photo.sight) for photo in problem.photographs)
     if not parameters:
@@ -48,14 +55,23 @@ def fit(
     given = [few, *(replace(few, lights=s.lights, material=s.material) for s in starts or [])]
     begun = [cheapest(family) for family in [given, *families(few)]]
     found = sorted((solve(start, parameters) for start in begun), key=lambda pair: pair[1])
-    near = [state for state, cost in found if cost < found[0][1] + _RIVAL]
+    near = _distinct([state for state, cost in found if cost < found[0][1] + _RIVAL], finalists)
     if count > 4 * _SEVERAL:
         # with many pixels most rivals can be told apart by some of them
-        thinned = thin(problem, _SEVERAL)
-        ends = [polish(_whole(thinned, state), known_noise=known_noise) for state in _distinct(near, finalists)]
-        lowest = min(f.cost for f in ends)
-        near = [f.problem for f in ends if f.cost < lowest + _RIVAL]
-    ended = [polish(_whole(problem, state), known_noise=known_noise) for state in _distinct(near, finalists)]
+        near = [f.problem for f in followed(problem, near)]
+    return near
+
+
+def followed(problem: Problem, states: Sequence[Problem]) -> list[Fitted]:
+    """Where some thousands of the problem's pixels lead from these states, the best first, without those that can no longer be the best."""
+    some = thin(problem, _SEVERAL)
+    ends = sorted((polish(_whole(some, state)) for state in states), key=lambda f: f.cost)
+    return [f for f in ends if f.cost < ends[0].cost + _RIVAL]
+
+
+def settled(problem: Problem, states: Sequence[Problem], *, known_noise: bool = True) -> Fitted:
+    """The best end on all pixels from these states, with the intervals of all that explain the pictures as well."""
+    ended = [polish(_whole(problem, state), known_noise=known_noise) for state in _distinct(states, len(states))]
     best = min(ended, key=lambda f: f.cost)
     others = [f for f in ended if f is not best and f.cost < best.cost + _AS_GOOD and _elsewhere(f, best)]
     known = profiled(best)
@@ -108,7 +124,7 @@ def _states_of(problem: Problem, state: Problem) -> tuple[Photograph, ...]:
     )
 
 
-def _distinct(begun: list[Problem], count: int) -> list[Problem]:
+def _distinct(begun: Sequence[Problem], count: int) -> list[Problem]:
     """The best starts, no two with nearly the same material and lights."""
     chosen: list[Problem] = []
     for p in begun:

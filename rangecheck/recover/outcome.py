@@ -7,11 +7,20 @@ from rangecheck.recover.fit import Estimate, Fitted
 from rangecheck.reflectance import Material
 
 
-def material_of(fitted: Fitted, name: str = "fitted") -> Material:
-    """The material that was found, at its wavelength; spike and lobe share the strength that both have (K_s).
+def material_of(fitted: Fitted, name: str = "fitted") -> tuple[Material, list[str]]:
+    """The material that was found, at its wavelength, and what had to be assumed; spike and lobe share the strength that both have (K_s).
 
-    Raises SceneError where the strengths add to more than 1: then irradiance or exposure was not what it was taken to be."""
-    guess = fitted.problem.material
+    A strength that the pictures do not determine, as of a highlight that is saturated, is at most what the surface does not send elsewhere. Raises
+    SceneError where strengths that they do determine add to more than 1: then irradiance or exposure was not what it was taken to be."""
+    guess, said = fitted.problem.material, []
+    open_ones = {e.name for e in fitted.estimates if e.low is None}
+    for mirrored in ("K_spike", "K_lobe"):
+        most = max(0.0, 1.0 - guess.K_lm)
+        if mirrored in open_ones and getattr(guess, mirrored) > most:
+            guess = guess.but(**{mirrored: most})
+            said.append(
+                f"{mirrored} is taken to be {most:.4g}, the most that a surface can mirror beside K_lm; the pictures do not determine it"
+            )
     both = min(guess.K_spike, guess.K_lobe)
     total = guess.K_lm + max(guess.K_spike, guess.K_lobe)
     if total > 1.0:
@@ -20,10 +29,11 @@ def material_of(fitted: Fitted, name: str = "fitted") -> Material:
             f"irradiance is in the pictures; give an irradiance at least {total:.3g} times as large",
             total=total,
         )
-    return Material(
+    material = Material(
         name, K_lm=guess.K_lm, K_ss=guess.K_spike - both, K_sl=guess.K_lobe - both, K_s=both, sigma_um=guess.sigma_um,
         correlation_um=guess.correlation_um, wavelengths_um=(guess.wavelength_um,), masking=guess.masking,
     )  # fmt: skip
+    return material, said
 
 
 def material_toml(material: Material, fitted: Fitted, source: str) -> str:

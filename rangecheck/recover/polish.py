@@ -67,16 +67,18 @@ class Fitted:
         raise SceneError(f"{name} was not fitted; there are {', '.join(e.name for e in self.estimates)}")
 
 
-def polish(problem: Problem, *, known_noise: bool = True) -> Fitted:
-    """Reweighted Gauss-Newton steps on all pixels from the problem's state, and the statistics of where they end."""
+def polish(problem: Problem, *, known_noise: bool = True, steps: int = _POLISH) -> Fitted:
+    """At most `steps` reweighted Gauss-Newton steps on all pixels from the problem's state, and the statistics of where they end."""
     parameters = problem.parameters()
     low, high = np.array([p.low for p in parameters]), np.array([p.high for p in parameters])
     theta = np.clip(problem.start(), low, high)
     free = np.ones(len(parameters), bool)
     converged, damping = False, 0.0
     normal, score, meat, cost, facts = accumulate(problem, theta)
-    evaluations = 1
+    evaluations, taken = 1, 0
     for _ in range(_POLISH):
+        if taken == steps:
+            break
         free = ~(((theta <= low) & (score > 0.0)) | ((theta >= high) & (score < 0.0)))
         step, spread = _step(normal, score, free, parameters, damping)
         moved = np.clip(theta + step, low, high)
@@ -91,6 +93,7 @@ def polish(problem: Problem, *, known_noise: bool = True) -> Fitted:
         small = bool((np.abs(moved - theta)[free] < _SETTLED * spread[free]).all()) or cost - trial[3] < _LITTLE
         theta, damping = moved, 0.1 * damping if damping > 1e-6 else 0.0
         normal, score, meat, cost, facts = trial
+        taken += 1
         if small:
             converged = True
             break
@@ -133,7 +136,7 @@ def _step(
     scaled = scaled + np.eye(len(scaled)) * 0.01 + np.diag(np.diag(scaled)) * damping
     step, spread = np.zeros(len(units)), np.full(len(units), np.inf)
     solved = np.linalg.solve(scaled, -(score * units)[free])
-    step[free] = np.clip(solved, -1.0, 1.0) * units[free]
+    step[free] = solved / max(1.0, float(np.abs(solved).max(initial=0.0))) * units[free]
     spread[free] = np.sqrt(np.maximum(np.diag(np.linalg.inv(scaled)), 0.0)) * units[free]
     return step, spread
 

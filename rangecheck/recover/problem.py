@@ -177,7 +177,7 @@ class Problem:
                 for n in range(POSE_NUMBERS):
                     whose, owner = ("camera", _ALL) if want.one_camera else (f"picture {k}", k)
                     name = f"{whose} {'turn' if n < 3 else 'shift'} {'xyz'[n % 3]}"
-                    unit = 0.01 if n < 3 else 0.01 * size
+                    unit = 0.02 if n < 3 else 0.02 * size
                     found.append(Parameter(name, "pose", owner, n, unit, -inf, inf))
         return found
 
@@ -308,16 +308,26 @@ class _Shown:
         values[start:stop] = value @ each + self.photo.ambient
         slopes[start:stop] = np.einsum("msj,s->mj", by_normal, each)
 
+    def _by_pose(self, start: int, stop: int, by: Sequence[FloatArray]) -> FloatArray:
+        """(m, 6) by the pose's numbers, from those by point, normal and view, (m, 3) each."""
+        along = np.concatenate(by, axis=1)[:, None, :]
+        return np.asarray((along @ self.photo.sight.by_pose[start:stop].reshape(stop - start, -1, POSE_NUMBERS))[:, 0])
+
     def fill(
         self, start: int, stop: int, values: FloatArray, jacobian: FloatArray, parameters: Sequence[Parameter],
         centre_slopes: Sequence[FloatArray], which: int,
     ) -> None:  # fmt: skip
-        value, by_material, by_centre, by_radius, by_point, by_normal, by_view = self._shade(start, stop)
+        value, by_material, by_centre, by_radius, *turned = self._shade(start, stop)
         exposure, ambient = self.photo.exposure, self.photo.ambient
         each = exposure * self.radiance
         light = value @ each
         values[start:stop] = light + ambient
         rows = jacobian[start:stop]
+        by_pose = (
+            self._by_pose(start, stop, [np.einsum("msj,s->mj", by, each) for by in turned])
+            if any(p.kind == "pose" for p in parameters)
+            else None
+        )
         for column, (p, move) in enumerate(zip(parameters, centre_slopes)):
             if p.kind in ("strength", "length"):
                 rows[:, column] = by_material[:, :, p.number] @ each
@@ -330,10 +340,8 @@ class _Shown:
                     rows[:, column] = light
                 elif p.kind == "ambient":
                     rows[:, column] = 1.0
-                else:
-                    by_pose = self.photo.sight.by_pose[start:stop, :, :, p.number]
-                    for by, part in ((by_point, 0), (by_normal, 1), (by_view, 2)):
-                        rows[:, column] += np.einsum("msj,mj,s->m", by, by_pose[:, part], each)
+                elif by_pose is not None:
+                    rows[:, column] = by_pose[:, p.number]
             elif p.owner in self.numbers:
                 k = self.numbers.index(p.owner)
                 light_k = self.lights[k]

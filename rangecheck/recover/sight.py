@@ -1,7 +1,8 @@
 """What each pixel of a photograph sees of a known shape: place, normal, direction to the camera, footprint, and how they move with the pose.
 
-World frame, millimetres. The pose's six numbers are a small turn (rad) about the camera's middle and a small shift (mm) of it, both in
-world axes; the triangle that a pixel sees is held. On it the normal changes as the corners' normals are interpolated, so that the
+World frame, millimetres. The pose's six numbers are a small turn (rad) of the camera and a small shift (mm) of it, both in world axes; it turns about
+its own middle or about a pivot. About the middle of what it sees turn and shift act apart: there a turn changes the view, a shift the picture's place.
+While it moves, the triangle that a pixel sees is held. On it the normal changes as the corners' normals are interpolated, so that the
 derivatives are exact for what is drawn.
 """
 
@@ -63,8 +64,13 @@ class Sight:
         return picture.reshape(*self.shape, *values.shape[1:])
 
 
-def see(scene: Scene, camera: Camera, world_from_camera: FloatArray, caster: EmbreeCaster | None = None, step: int = 1) -> Sight:
-    """What the middles of every `step`-th row and column of pixels see. Raises SceneError where they see nothing."""
+def see(
+    scene: Scene, camera: Camera, world_from_camera: FloatArray, caster: EmbreeCaster | None = None, step: int = 1,
+    pivot_mm: FloatArray | None = None,
+) -> Sight:  # fmt: skip
+    """What the middles of every `step`-th row and column of pixels see; `by_pose` is for turns about `pivot_mm` (3,), the camera's middle if not said.
+
+    Raises SceneError where they see nothing."""
     pose = rigid.checked(world_from_camera, "world_from_camera")
     caster = caster or EmbreeCaster(scene.surface.vertices, scene.surface.faces)
     rows, columns = np.arange(0, camera.height, step), np.arange(0, camera.width, step)
@@ -103,6 +109,9 @@ def see(scene: Scene, camera: Camera, world_from_camera: FloatArray, caster: Emb
     spans, footprints = _footprints(points, normals, rays[seen], hit, seen, (h, w))
     pixel = (rows[seen // w] * camera.width + columns[seen % w]).astype(np.int64)
     by_pose = _by_pose(points, facing, by_place, origins[seen], rays[seen], pose[:3, 3])
+    if pivot_mm is not None:
+        # a turn about the pivot is one about the camera's middle, and the shift that takes the middle around
+        by_pose[..., :3] += by_pose[..., 3:] @ np.cross(np.eye(3), pose[:3, 3] - pivot_mm).T
     return Sight(
         pixel, hit, points, normals, facing, -rays[seen], footprints / step, spans / step, by_pose, (camera.height, camera.width)
     )

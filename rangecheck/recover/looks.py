@@ -1,0 +1,160 @@
+"""A fit to photographs of a known shape: what a pixel sees of it changes with the camera's pose, and shadows change with the lamps.
+
+While numbers are moved, both are held (`sight`). So steps and looks - rays from where the camera is now known to stand, shadows of the lamps as now known -
+take turns. A pose is first found roughly, on few pixels with as much noise as what does not fit: while the picture does not lie on the shape, it says little
+of lobes. Then all starts are tried again; the best is followed, a few steps a look, until the pose stands still beside its own uncertainty, and
+the last look is fitted with all pixels. World frame, millimetres.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from rangecheck import rigid
+from rangecheck.arrays import FloatArray
+from rangecheck.optics import PinholeCamera
+from rangecheck.raycast import EmbreeCaster
+from rangecheck.recover.fit import explored, followed, settled
+from rangecheck.recover.lights import Light
+from rangecheck.recover.polish import TWO_SIDED_95, Fitted, accumulate, polish
+from rangecheck.recover.problem import Photograph, Problem
+from rangecheck.recover.sight import Sight, lit_by, see
+from rangecheck.recover.starts import with_best_strengths
+from rangecheck.scene import Scene
+
+#: cosine below which a pixel is left out: grazing views, where the model's bound and the shape's own errors count
+_LEAST_COSINE = 0.3
+#: the most looks, and steps of each;  a pose that moved by less than this share of its standard deviations stands still
+_LOOKS, _STEPS, _STILL = 20, 3, 0.2
+#: pixels that a rough look has about
+_ROUGH = 16000
+#: cosine of the angle by which lamps may turn before all starts are tried again, under their new shadows
+_SAME_SHADOWS = math.cos(math.radians(10.0))
+
+
+@dataclass
+class Look:
+    """A camera that looks at a surface, from a pose that a fit may move by turns about the middle of the surface, and shifts; and the pictures (h, w) that
+    it took, linear, in parts of full scale, one lamp each, with their noise."""
+
+    scene: Scene
+    caster: EmbreeCaster
+    camera: PinholeCamera
+    pose: FloatArray
+    pictures: Sequence[FloatArray]
+    noise: float
+
+    @property
+    def pivot_mm(self) -> FloatArray:
+        """(3,) what the camera turns about."""
+        return np.asarray(self.scene.surface.bounds_mm.mean(axis=0))
+
+    def see(self, step: int = 1) -> Sight:
+        """The pixels that see the surface at angles that can be trusted, of every `step`-th row and column."""
+        return facing(see(self.scene, self.camera, self.pose, self.caster, step, self.pivot_mm))
+
+    def at(self, problem: Problem, state: Problem, step: int = 1) -> Problem:
+        """The problem at a state, seen from the present pose under that state's lamps."""
+        taken = photographs(self.see(step), self.pictures, state.lights, self.noise, self.caster)
+        photos = tuple(replace(t, exposure=p.exposure, ambient=p.ambient) for t, p in zip(taken, state.photographs))
+        return replace(problem, photographs=photos, lights=state.lights, material=state.material)
+
+    def move(self, pose: FloatArray) -> None:
+        """Move by small turns (rad) and shifts (mm), (6,)."""
+        turn, angle = pose[:3], float(np.linalg.norm(pose[:3]))
+        if angle > 0.0:
+            about = rigid.about_axis(turn / angle, angle)[:3, :3]
+            self.pose[:3, :3] = about @ self.pose[:3, :3]
+            self.pose[:3, 3] = self.pivot_mm + about @ (self.pose[:3, 3] - self.pivot_mm)
+        self.pose[:3, 3] += pose[3:]
+
+
+class CameraFound(NamedTuple):
+    """The pose (4, 4) world from camera;  within_mm (3,) of its place and turn_within_rad of its directions, 95 %; None where a part is not determined."""
+
+    world_from_camera: FloatArray
+    within_mm: FloatArray | None
+    turn_within_rad: float | None
+
+
+def facing(sight: Sight) -> Sight:
+    """The pixels that see the surface steeply enough."""
+    return sight.only((sight.normals * sight.views).sum(1) > _LEAST_COSINE)
+
+
+def photographs(
+    sight: Sight, pictures: Sequence[FloatArray], lamps: Sequence[Light], noise: float, caster: EmbreeCaster | None
+) -> tuple[Photograph, ...]:
+    """Pictures (h, w), linear in parts of full scale, one lamp each, as a fit takes them; without a caster nothing is in shadow."""
+    photos = []
+    for k, picture in enumerate(pictures):
+        seen = picture.reshape(-1)[sight.pixel]
+        lit = np.ones((len(sight), 1), bool) if caster is None else lit_by(sight, (lamps[k],), caster)
+        photos.append(Photograph(sight, seen, np.full(len(seen), noise), lit, (k,)))
+    return tuple(photos)
+
+
+def fit_looking(problem: Problem, look: Look) -> tuple[Fitted, CameraFound | None]:
+    """Fit the problem, whose pixels are what `look` sees, and move `look` to where its camera is found; that, if its pose is unknown."""
+    pose = problem.unknowns.pose
+    step = max(1, round(math.sqrt(max(len(photo.sight) for photo in problem.photographs) / _ROUGH)))
+    state = problem
+    if pose:
+        state = _walked(problem, explored(_widened(with_best_strengths(problem)))[0], look, step, roughly=True)
+    states = [state]
+    for _ in range(_LOOKS):
+        problem = look.at(problem, state)
+        states = explored(problem, starts=states[1:])
+        state = states[0]
+        if pose:
+            state = _walked(problem, _walked(problem, state, look, step), look, 1)
+        if all(float(a.direction @ b.direction) > _SAME_SHADOWS for a, b in zip(problem.lights, state.lights)):
+            break
+    problem = look.at(problem, state)
+    fitted = settled(problem, [f.problem for f in followed(problem, [state, *states[1:]])], known_noise=False)
+    _moved(look, fitted)
+    return fitted, _camera(fitted, look) if pose else None
+
+
+def _walked(problem: Problem, state: Problem, look: Look, step: int, *, roughly: bool = False) -> Problem:
+    """The state where looks of every `step`-th row and column and their steps lead to; `look` is moved along. roughly: noise is taken to be as large as
+    what does not fit, so that nothing is an outlier yet."""
+    for _ in range(_LOOKS):
+        now = look.at(problem, state, step)
+        end = polish(_widened(now) if roughly else now, steps=_STEPS)
+        state = end.problem
+        if _moved(look, end):
+            break
+    return state
+
+
+def _widened(problem: Problem) -> Problem:
+    """The problem with noise as large as what does not fit."""
+    wide = max(1.0, accumulate(problem, problem.start())[4][0])
+    return replace(problem, photographs=tuple(replace(photo, noise=wide * photo.noise) for photo in problem.photographs))
+
+
+def _moved(look: Look, fitted: Fitted) -> bool:
+    """Move `look` by the pose that was found; whether that was little beside what is not known of it."""
+    at = [k for k, p in enumerate(fitted.parameters) if p.kind == "pose"]
+    if not at:
+        return True
+    found, spread = fitted.theta[at], np.sqrt(np.diag(fitted.determination.covariance)[at])
+    look.move(found)
+    return bool((np.abs(found) <= _STILL * spread).all())
+
+
+def _camera(fitted: Fitted, look: Look) -> CameraFound:
+    at = [k for k, p in enumerate(fitted.parameters) if p.kind == "pose"]
+    spread = fitted.determination.covariance[np.ix_(at, at)]
+    known = [fitted.estimates[k].low is not None for k in at]
+    around = np.cross(np.eye(3), look.pose[:3, 3] - look.pivot_mm)
+    move = np.hstack([around.T, np.eye(3)])
+    within = TWO_SIDED_95 * np.sqrt(np.diag(move @ spread @ move.T))
+    turn = TWO_SIDED_95 * math.sqrt(float(np.linalg.eigvalsh(spread[:3, :3])[-1]))
+    return CameraFound(look.pose, within if all(known) else None, turn if all(known[:3]) else None)
