@@ -249,3 +249,12 @@ def test_a_3mf_whose_parts_hold_each_other_too_often_or_in_a_circle_is_refused(t
     )
     with pytest.raises(InputError, match="places its parts more than"):
         read_mesh(three_mf(tmp_path / "deep.3mf", TETRAHEDRON + twice, '<item objectid="29"/>'))
+
+
+def test_a_3mf_whose_members_are_damaged_is_refused(tmp_path):
+    path = three_mf(tmp_path / "good.3mf", TETRAHEDRON, '<item objectid="1"/>')
+    content = path.read_bytes()
+    for at in (content.rindex(b"PK\x03\x04"), content.rindex(b"PK\x03\x04") + 60):  # the member's header, and what it packs
+        path.write_bytes(content[:at] + b"\xff\xff" + content[at + 2 :])
+        with pytest.raises(InputError, match="cannot be read as 3MF"):
+            read_mesh(path)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import re
 import zipfile
+import zlib
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -241,6 +242,26 @@ def _refuse_to_swell(path: Path, content: bytes) -> None:
 
 def _refuse_to_multiply(path: Path, content: bytes) -> None:
     """Refuse a 3MF whose components of components place its parts more often than its reader follows; it would leave the rest out."""
+    try:
+        placed, inside = _parts_of(content)
+    except (zipfile.BadZipFile, zlib.error, ValueError, NotImplementedError, RuntimeError, EOFError, OSError) as error:
+        raise InputError(path, f"cannot be read as 3MF ({error}); export it again") from None
+    times = 0
+    for _ in range(len(inside) + 1):  # one level of components after another; a circle of them has no last
+        times += placed.total()
+        below: Counter[_Part] = Counter()
+        for part, count in placed.items():
+            for component in inside.get(part, ()):
+                below[component] += count
+        placed = below
+        if not placed or times > MOST_PLACED:
+            break
+    if placed or times > MOST_PLACED:
+        raise InputError(path, f"places its parts more than {MOST_PLACED} times, in each other; export it again as one mesh")
+
+
+def _parts_of(content: bytes) -> tuple[Counter[_Part], dict[_Part, list[_Part]]]:
+    """What the build of a 3MF places, how often each, and the components of each object."""
     inside: dict[_Part, list[_Part]] = {}
     placed: Counter[_Part] = Counter()
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -256,18 +277,7 @@ def _refuse_to_multiply(path: Path, content: bytes) -> None:
                     placed[part] += 1
                 elif within is not None:
                     inside.setdefault(within, []).append(part)
-    times = 0
-    for _ in range(len(inside) + 1):  # one level of components after another; a circle of them has no last
-        times += placed.total()
-        below: Counter[_Part] = Counter()
-        for part, count in placed.items():
-            for component in inside.get(part, ()):
-                below[component] += count
-        placed = below
-        if not placed or times > MOST_PLACED:
-            break
-    if placed or times > MOST_PLACED:
-        raise InputError(path, f"places its parts more than {MOST_PLACED} times, in each other; export it again as one mesh")
+    return placed, inside
 
 
 def _through_trimesh(path: Path, content: bytes, kind: str) -> tuple[FloatArray, IntArray, str]:
