@@ -1,6 +1,7 @@
 """What damaged files and killed jobs are answered with; each of these inputs once brought about something else than one clear line."""
 
 import json
+import math
 import os
 import signal
 import struct
@@ -16,7 +17,7 @@ from rangecheck.dataset.ranges import read_ranges
 from rangecheck.errors import InputError, OutputError, RangecheckError
 from rangecheck.export.camera_files import read_camera_json
 from rangecheck.export.map_files import read_maps_npz
-from rangecheck.files import presets_folder
+from rangecheck.files import presets_folder, write_json
 from rangecheck.modeler import read_model
 from rangecheck.optics import PinholeCamera
 from rangecheck.pipeline import materials, report
@@ -30,6 +31,7 @@ from rangecheck.solid.check_file import check_mesh_file
 from rangecheck.solid.printer import printer
 from rangecheck.studies.forked_command import Moment, forked_command
 from rangecheck.studies.hardness_jobs import SMALL, faults, left_over, small_scans, whole_files
+from rangecheck.studies.hardness_machines import differences
 from rangecheck.studies.scenes import ball
 from rangecheck.studies.whole_commands import command_line
 from rangecheck.surface.mesh_files import read_mesh
@@ -274,3 +276,18 @@ def test_a_report_is_made_of_a_whole_job_only_and_of_its_own_folder(spoil, tmp_p
 def test_no_report_is_made_where_no_job_was_finished(tmp_path):
     with pytest.raises(InputError, match="no finished job"):
         report(str(tmp_path), reporter=Reporter())
+
+
+def test_jobs_of_two_machines_are_compared_by_the_numbers_in_their_files(tmp_path):
+    for name, length, word in (("one", 2.0, "fit"), ("other", 2.0 + 4e-12, "unfit")):
+        write_json(tmp_path / name / "a.json", {"lengths_mm": [[8.0, length]], "seconds": length})
+        write_json(tmp_path / name / "b.json", {"verdict": word, "key": word})
+        (tmp_path / name / "same.txt").write_text("as ever")
+        np.savez(
+            tmp_path / name / "c.npz", distance=np.array([length, np.nan, 4.0]), text=np.array(json.dumps({"seconds": length}))
+        )
+    (tmp_path / "one" / "lost.txt").write_text("there")
+    found = {one.file: one.relative for one in differences(tmp_path / "one", tmp_path / "other")}
+    assert found.pop("a.json") == pytest.approx(4e-12 / 8, rel=1e-3)
+    assert found.pop("c.npz") == pytest.approx(1e-12, rel=1e-3)
+    assert found == {"b.json": math.inf, "lost.txt": math.inf}

@@ -1,4 +1,4 @@
-"""What the job survives: SIGKILL at random moments, a full disk at every stage, fifty subjects in one process.
+"""What the job survives: SIGKILL at random moments, a full disk at every stage, fifty subjects in one process, an older processor.
 
 A killed job stays in its folder, and the next kill strikes the job that takes it up again. After one to four kills in a row it is left to
 finish, and its bytes are compared with the undisturbed job's. The parts kills-1 ... kills-5 together are 200 kills.
@@ -22,6 +22,7 @@ from rangecheck.errors import RangecheckError
 from rangecheck.studies.forked_command import Forked, Moment, forked_command
 from rangecheck.studies.hardness_disk import DISK_PARTS
 from rangecheck.studies.hardness_jobs import FINISHED, LOCK, SMALL, UNFINISHED, faults, left_over, small_scans, whole_files
+from rangecheck.studies.hardness_machines import machines_part
 from rangecheck.studies.whole_commands import command_line
 from rangecheck.study import Part, study_of_parts
 from rangecheck.study.memory import held_mb
@@ -116,6 +117,6 @@ def _memory_part(quick: bool) -> Part:
 
 
 _PARTS: dict[str, Callable[[bool], Part]] = {f"kills-{k + 1}": partial(_kills_part, seed=k + 1) for k in range(PIECES)}
-_PARTS |= DISK_PARTS | {"memory": _memory_part}
+_PARTS |= DISK_PARTS | {"memory": _memory_part, "machines": machines_part}
 PARTS = tuple(_PARTS)
 study = study_of_parts("hardness", "Hardness: kills, full disks and long runs", _PARTS)

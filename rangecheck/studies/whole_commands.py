@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,11 +35,13 @@ class Run:
     document: dict[str, Any]
 
 
-def command(*arguments: str) -> Run:
-    """`rangecheck ARGUMENTS --json -q`, measured. Raises RangecheckError with its last words when it fails."""
+def command(*arguments: str, environment: Mapping[str, str] | None = None) -> Run:
+    """`rangecheck ARGUMENTS --json -q`, with more variables in its environment, measured. Raises RangecheckError with its last words when it fails."""
     begin = time.perf_counter()
     with tempfile.TemporaryFile() as said, tempfile.TemporaryFile() as complaint:
-        process = subprocess.Popen(command_line(arguments), stdout=said, stderr=complaint)
+        process = subprocess.Popen(
+            command_line(arguments), stdout=said, stderr=complaint, env={**os.environ, **(environment or {})}
+        )
         _, status, usage = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)
         seconds = time.perf_counter() - begin
