@@ -10,7 +10,7 @@ from rangecheck.errors import InputError
 from rangecheck.export.meshes import write_mesh
 from rangecheck.export.stl import write_stl
 from rangecheck.files import write_json
-from rangecheck.solid import Solid
+from rangecheck.solid import Solid, judges
 from rangecheck.solid.check_file import check_mesh_file
 from rangecheck.solid.opinions import TOO_LITTLE, disagreements, second_opinions
 from rangecheck.solid.printer import printer
@@ -104,7 +104,7 @@ def test_a_program_that_cannot_read_the_file_has_no_opinion(tmp_path):
     (tmp_path / "x.stl").write_bytes(b"nothing of the kind")
     opinions = second_opinions(tmp_path / "x.stl", cube())
     assert opinions[1].closed is None and opinions[2].closed is None and opinions[2].error
-    assert disagreements(cube(), opinions, 1.0) == []
+    assert {found.code for found in disagreements(cube(), opinions, 1.0)} == {"no-opinion"}
 
 
 def test_a_solid_file_is_judged_for_printing_too_and_all_of_it_is_json(tmp_path):
@@ -141,3 +141,13 @@ def test_folds_slivers_and_short_edges_are_named():
     far = cube(1.0, (1e6, 0, 0))
     assert {f.code for f in shape_findings(far)} == {"short-edges"} or np.spacing(np.float32(1e6)) * 8 < 1.0
     assert [f.code for f in shape_findings(cube(1.0, (4e6, 0, 0)))] == ["short-edges"]
+
+
+def test_a_program_that_crashes_over_a_mesh_is_a_finding_and_the_check_goes_on(tmp_path, monkeypatch):
+    script = tmp_path / "crashing.py"
+    script.write_text("import os, signal\nos.kill(os.getpid(), signal.SIGSEGV)\n")
+    monkeypatch.setattr(judges, "__file__", str(script))
+    path = tmp_path / "torus.ply"
+    write_mesh(torus(24, 16), path)
+    found = [one for one in check_mesh_file(path, opinions=True).verdict.findings if one.code == "no-opinion"]
+    assert len(found) == 3 and all("SIGSEGV" in one.message and one.severity == "note" for one in found)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import tempfile
@@ -40,6 +41,8 @@ TIMEOUT_S = 120
 TOGETHER = 2
 #: the error of a program that was given a bound which it passed, and how programs end then, unless by a signal
 TOO_LITTLE = "needs more memory than memory_mb leaves for it; a higher memory_mb lets it answer"
+#: the error of a program that is not there begins so: judges.py
+ABSENT = "not installed"
 #: no room for a thread's stack is told as pthread_create's failure, and Python 3.13 may fail to compile a module with no exception set
 _STARVED = re.compile("bad_alloc|[Mm]emory|not map|map segment|pthread_create|returned NULL without setting an exception")
 _NONE = np.empty(0, np.int64)
@@ -146,9 +149,11 @@ def answer(program: str, process: subprocess.Popen[str]) -> Opinion:
         process.communicate()
         return Opinion(program, None, error=f"gave no answer in {TIMEOUT_S} s")
     if process.returncode != 0:
-        last = errors.strip().splitlines()[-1:] or [f"ended with status {process.returncode}"]
-        starved = process.returncode < 0 or _STARVED.search(last[0])
-        return Opinion(program, None, error=TOO_LITTLE if memory.bounded() and starved else last[0][:200])
+        crashed = process.returncode < 0
+        how = f"ended by {signal.Signals(-process.returncode).name}" if crashed else f"ended with status {process.returncode}"
+        last = how if crashed else (errors.strip().splitlines() or [how])[-1]
+        starved = crashed or _STARVED.search(last)
+        return Opinion(program, None, error=TOO_LITTLE if memory.bounded() and starved else last[:200])
     said = json.loads(out.strip().splitlines()[-1])
     return Opinion(
         program,
@@ -168,11 +173,13 @@ def disagreements(
     judged: Sequence[Finding] = (),
 ) -> list[Finding]:
     """One finding per program that judges closedness, or which faces cross, otherwise than rangecheck, with the cause as far as it can be
-    proved. `judged` are rangecheck's findings about the same surface."""
+    proved, or that is there and gave no answer. `judged` are rangecheck's findings about the same surface."""
     ours = opinions[0].closed
     found = []
     for other in opinions[1:]:
         found += _about_crossings(surface, other, judged, severities)
+        if other.error and not other.error.startswith(ABSENT):
+            found.append(finding("no-opinion", 1, f"{other.program} gave no opinion: {other.error}", None, None, severities))
         if other.closed is None or other.closed == ours:
             continue
         cause = _cause(surface, other, unit_mm)
