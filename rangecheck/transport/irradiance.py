@@ -17,23 +17,24 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from rangecheck.arrays import BoolArray, FloatArray, IntArray
 from rangecheck.errors import SceneError
 from rangecheck.kernels import in_chunks, thread_count
+from rangecheck.raycast import EmbreeCaster
 from rangecheck.reflectance import Material
+from rangecheck.scene import Scene
+from rangecheck.scene.surroundings import SurroundingsArrays
 from rangecheck.surface.edges import every_edge_passed_both_ways
+from rangecheck.transport.geometry import Geometry, SourceArrays
 from rangecheck.transport.irradiance_nodes import areas, joined, nodes_of, pieces
 from rangecheck.transport.irradiance_stages import look_out, look_up, mix, see_sky, stand, sum_up
 from rangecheck.transport.light import add_light, aim
 from rangecheck.transport.queues import KIND_NAMES, LOBE, new_hits, new_rays, new_shadows
-from rangecheck.transport.reflection import materials_of
-
-if TYPE_CHECKING:
-    from rangecheck.transport.tracer import Tracer
+from rangecheck.transport.reflection import Materials, materials_of
 
 #: rays of each record
 RAYS = 128
@@ -110,13 +111,24 @@ def nothing_stored(channels: int) -> Stored:
     return Stored(faces, np.empty(0, np.int32), np.empty((0, channels), np.float32), np.empty((0, channels)), 0, np.empty(0))
 
 
-def may_be_cached(tracer: Tracer) -> bool:
+class Traced(Protocol):
+    """A scene ready for the stages, as a `Tracer` is."""
+
+    scene: Scene
+    caster: EmbreeCaster
+    geometry: Geometry
+    sources: SourceArrays
+    surroundings: SurroundingsArrays
+    materials: Materials
+
+
+def may_be_cached(tracer: Traced) -> bool:
     """Whether nothing in the scene shines: what leaves a surface is then the same in every direction."""
     return not tracer.materials.shiny.any()
 
 
 def gather_irradiance(
-    tracer: Tracer, *, depth: int = 64, error: float = 0.01, records: int = 6000, shadow_rays: int = 1, seed: int = 0
+    tracer: Traced, *, depth: int = 64, error: float = 0.01, records: int = 6000, shadow_rays: int = 1, seed: int = 0
 ) -> IrradianceCache:
     """The light that reaches every place of a matt scene from its surroundings and after up to depth - 1 reflections at other places, with
     interpolation off by at most `error` of the mean light on the surface, or as near as the most records bring it (`met` says).
@@ -133,7 +145,7 @@ def gather_irradiance(
 class _Gathering:
     """One scene's nodes, its light straight from the sources, and what records gather of it."""
 
-    def __init__(self, tracer: Tracer, depth: int, records: int, shadow_rays: int, seed: int) -> None:
+    def __init__(self, tracer: Traced, depth: int, records: int, shadow_rays: int, seed: int) -> None:
         self.tracer, self.depth, self.records, self.shadow_rays, self.seed = tracer, depth, records, shadow_rays, seed
         self.channels = tracer.scene.channels
         nodes = nodes_of(tracer.geometry, _NODES_PER_RECORD * records)
