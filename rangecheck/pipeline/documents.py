@@ -112,7 +112,7 @@ def _shared() -> dict[str, Shape]:
             never_seen=NUMBER, unseen_mm2=NUMBER, hidden_mm2=NUMBER, gaps=COUNT, spacing_mm=NUMBER, expected_error_mm=NUMBER,
             step_mm=NUMBER, views=many(fields_of(worth.ViewQuality)),
             pairs=many(record(a=TEXT, b=TEXT, overlap=NUMBER, residual_mm=NUMBER, expected_mm=NUMBER)),
-            next_view=or_null(fields_of(worth.NextView, direction=POINT)), findings=many(fields_of(worth.Finding, places_mm=many(POINT))),
+            next_view=or_null(fields_of(worth.NextView, direction=POINT)), findings=many(fields_of(worth.Finding, places_mm=maybe(many(POINT)))),
         ),
         "refined": record(name=TEXT, refined=NUMBER, refused=maybe(TEXT), moved_rms_mm=maybe(NUMBER), painted=maybe(NUMBER)),
         "consistency": record(_consistency(fields_of(Speckle), fields_of(Outline), fields_of(Place, centre_mm=POINT))),
