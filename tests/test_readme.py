@@ -1,6 +1,7 @@
 """Every command in README works as it stands there, in order, and every picture and path that it names exists."""
 
 import re
+import tomllib
 from pathlib import Path
 
 from conftest import readme_commands
@@ -60,8 +61,17 @@ def test_every_picture_in_readme_exists():
 
 def test_every_room_of_the_map_exists():
     rows = re.findall(r"^\| (`[^|]+`) \|", README.split("## The map of the code")[1], re.M)
-    rooms = [room for row in rows for room in re.findall(r"`([a-z]+)/?`", row)]
-    assert len(rooms) > 15
+    rooms = [room for row in rows for room in re.findall(r"`([a-z_]+)/?`", row)]
+    there = {path.stem for path in (ROOT / "rangecheck").iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
+    assert {*rooms} - {"cli"} == there - {"__init__"} and len(rooms) == len({*rooms})
     for room in rooms:
         place = ROOT / "cli" if room == "cli" else ROOT / "rangecheck" / room
         assert place.is_dir() or place.with_suffix(".py").is_file(), room
+
+
+def test_every_package_that_may_be_installed_has_its_licence_told():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    wanted = [*project["dependencies"], *(one for extra in project["optional-dependencies"].values() for one in extra)]
+    names = {re.match(r"[\w.-]+", one)[0] for one in wanted}
+    told = README.split("## Dependencies and their licences")[1].split("\n## ")[0]
+    assert len(names) > 25 and {name for name in names if not re.search(rf"\b{re.escape(name)}\b", told)} == set()

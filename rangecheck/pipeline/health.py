@@ -31,11 +31,18 @@ PACKAGES = {
     "cv2": ("opencv-contrib-python-headless", "images and structured light", True),
     "imageio_ffmpeg": ("imageio-ffmpeg", "video", True),
     "matplotlib": ("matplotlib", "charts", True),
+    "PIL": ("pillow", "pictures", True),
+    "pydantic": ("pydantic", "settings", True),
+    "jinja2": ("jinja2", "the report", True),
+    "click": ("click", "the command line", True),
+    "rich": ("rich", "progress", True),
     "open3d": ("open3d", "Poisson meshing, ball pivoting, registration", False),
     "pymeshlab": ("pymeshlab", "second opinions, repair", False),
     "pye57": ("pye57", "E57 scans", False),
     "lib3mf": ("lib3mf", "3MF files", False),
     "OpenEXR": ("openexr", "EXR maps", False),
+    "networkx": ("networkx", "3MF and GLB with several parts", False),
+    "lxml": ("lxml", "3MF files", False),
     "distributed": ("distributed", "frames on many machines", False),
 }
 EXTRA = {
@@ -44,6 +51,8 @@ EXTRA = {
     "pye57": "formats",
     "lib3mf": "formats",
     "OpenEXR": "formats",
+    "networkx": "formats",
+    "lxml": "formats",
     "distributed": "distributed",
 }
 #: what packages need of Debian beyond themselves
