@@ -100,6 +100,15 @@ def test_a_large_mesh_is_cut_face_by_face_and_its_file_does_not_depend_on_the_me
     assert "base" in said["areas"]["parts"]
 
 
+def test_walls_that_there_is_no_memory_to_look_at_are_named_and_the_part_is_written(tmp_path, monkeypatch):
+    write_mesh(BALL, tmp_path / "ball.ply")
+    monkeypatch.setattr("rangecheck.pipeline.printable.BYTES_OF_WALLS", 1e12)
+    line = ["solid", str(tmp_path / "ball.ply"), "-o", str(tmp_path / "b.stl"), "--memory-mb", "20000", "--height-mm", "30"]
+    assert exit_status(line) == 0 and (tmp_path / "b.stl").exists()
+    said = json.loads((tmp_path / "b.stl.json").read_text())
+    assert any(f["code"] == "left-out" and "walls" in f["message"] for f in said["read_back"]["findings"]) and "walls" not in said
+
+
 def test_what_a_surface_was_before_it_was_cut_is_held_no_longer(monkeypatch):
     def cut(*arguments):
         return trimmed(*arguments[:1], height_mm=0.0)

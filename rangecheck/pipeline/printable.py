@@ -6,12 +6,16 @@ from typing import Any
 
 import numpy as np
 
+from rangecheck import memory
 from rangecheck.config import Settings
 from rangecheck.config.schema import Solidify
 from rangecheck.pipeline.outcome import document
 from rangecheck.solid import Solid
+from rangecheck.solid.findings import Finding, finding
 from rangecheck.solid.printer import Printer, printer
 
+#: what the look at walls, and what the whole check and the advice, take of a face (measured from 2e5 to 2e6 faces: 305 to 385, 540 to 660)
+BYTES_OF_WALLS, BYTES_OF_PRINTING = 385, 660
 #: orientations that are printed
 SHOWN = 5
 
@@ -20,6 +24,19 @@ def printer_of(wanted: Solidify) -> Printer | None:
     """The profile that the part is judged for, if one was named."""
 
     return printer(wanted.printer) if wanted.printer else None
+
+
+def left_out(solid: Solid, settings: Settings) -> list[Finding]:
+    """What `printing_of` has no room for where memory is bounded, as a finding; empty where it has."""
+    wanted = settings.solid
+    if wanted.printer is None and wanted.height_mm is None and wanted.wall_mm is None:
+        return []
+    what, of_face = ("printing", BYTES_OF_PRINTING) if wanted.printer else ("walls", BYTES_OF_WALLS)
+    takes = of_face * len(solid.surface.faces) / 1e6
+    if takes <= memory.left_mb():
+        return []
+    words = f"not judged: {what}, which takes about {takes:,.0f} MB, more than memory_mb leaves"
+    return [finding("left-out", 1, words, severities=settings.checking.severities)]
 
 
 def printing_of(solid: Solid, settings: Settings, *, orient: bool) -> tuple[dict[str, Any], list[str]]:

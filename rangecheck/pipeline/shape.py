@@ -15,7 +15,7 @@ from rangecheck.files import write_json
 from rangecheck.pipeline.folder import check_writable
 from rangecheck.pipeline.health import versions
 from rangecheck.pipeline.outcome import Outcome, document
-from rangecheck.pipeline.printable import printer_of, printing_of
+from rangecheck.pipeline.printable import left_out, printer_of, printing_of
 from rangecheck.pipeline.subject import eye_of, hashes, read_subject
 from rangecheck.progress import Reporter
 from rangecheck.rigid import inverse
@@ -307,6 +307,8 @@ def solid(
     if made.solid is not None and written is not None:
         forget_edges(written.read_back)
         near = weld_findings(written.read_back, severities=settings.checking.severities)
+        unjudged = left_out(made.solid, settings)
+        near += unjudged
         reread = verdict([*written.verdict.findings, *near], written.verdict.facts)
         content["read_back"] = reread.to_dict() | {
             "faces": written.faces, "moved_by_rounding_mm": written.moved_mm, "weld_mm": weld_distance_mm(written.read_back)
@@ -314,7 +316,7 @@ def solid(
         lines += [f"{out}: {written.faces:,} faces, read back as a slicer would and checked: {written.verdict.sentence()}"]
         lines += [f"  {f.severity:<8} {f.code}: {f.message}" for f in near]
         with reporter.stage("printing"):
-            printed, printing_lines = printing_of(made.solid, settings, orient=orient)
+            printed, printing_lines = ({}, []) if unjudged else printing_of(made.solid, settings, orient=orient)
         content |= printed
         lines += printing_lines
         fit = printed.get("fit", True)
