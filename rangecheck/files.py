@@ -11,6 +11,8 @@ import os
 import re
 import tempfile
 import tomllib
+import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -22,6 +24,19 @@ from rangecheck.errors import InputError, OutputError
 _PART = re.compile(r"\..+\.[a-z0-9_]{8}\.part(\.[^.]+)?")
 #: what this process is writing
 _under_way: set[Path] = set()
+#: what zipfile and NumPy raise for damaged archives, for headers that lie, and for versions and packings that do not exist
+DAMAGED_ARCHIVE = (
+    OSError,
+    EOFError,
+    zipfile.BadZipFile,
+    zlib.error,
+    RuntimeError,
+    ValueError,
+    KeyError,
+    TypeError,
+    OverflowError,
+    MemoryError,
+)
 
 
 @contextmanager

@@ -254,7 +254,8 @@ def test_a_3mf_whose_parts_hold_each_other_too_often_or_in_a_circle_is_refused(t
 def test_a_3mf_whose_members_are_damaged_is_refused(tmp_path):
     path = three_mf(tmp_path / "good.3mf", TETRAHEDRON, '<item objectid="1"/>')
     content = path.read_bytes()
-    for at in (content.rindex(b"PK\x03\x04"), content.rindex(b"PK\x03\x04") + 60):  # the member's header, and what it packs
+    member, listed = content.rindex(b"PK\x03\x04"), content.rindex(b"PK\x01\x02")
+    for at in (member, member + 60, listed + 6):  # the member's header, what it packs, and the version needed to read it
         path.write_bytes(content[:at] + b"\xff\xff" + content[at + 2 :])
         with pytest.raises(InputError, match="cannot be read as 3MF"):
             read_mesh(path)

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import io
 import json
-import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
@@ -18,16 +16,12 @@ from rangecheck.export.legend import NOTHING as NOTHING_COLOUR
 from rangecheck.export.legend import Swatches, framed, span_text
 from rangecheck.export.mapped import coloured_ids, coloured_map, coloured_normals, contour_picture, range_of
 from rangecheck.export.pictures import write_id_png16, write_map_png16, write_normals_png16, write_png
-from rangecheck.files import read_bytes, whole_file, write_json
+from rangecheck.files import DAMAGED_ARCHIVE, read_bytes, whole_file, write_json
 from rangecheck.maps import Chain, Maps, Shadows
 from rangecheck.maps.shadow import LIT, NOTHING, SHADED, STATE_NAMES, TURNED_AWAY
 from rangecheck.optics import OrthographicCamera, PinholeCamera, camera_from_dict
 
 SCHEMA = "rangecheck/maps/1"
-#: what NumPy and zipfile raise for damaged archives, and for headers that lie
-_DAMAGED = (
-    OSError, EOFError, BadZipFile, zlib.error, RuntimeError, ValueError, KeyError, TypeError, OverflowError, MemoryError, RangecheckError,
-)  # fmt: skip
 #: share of the pixels whose signed values the colours reach; a few far ones would leave the others white
 SHOWN = 0.99
 
@@ -76,7 +70,7 @@ def read_maps_npz(path: str | Path) -> Maps:
                     for name in ("world_from_camera", "distance_mm", "depth_mm", "normals", "incidence_rad", "part_id", "face")
                 },
             )
-    except _DAMAGED as error:
+    except (*DAMAGED_ARCHIVE, RangecheckError) as error:
         raise InputError(path, f"does not hold maps ({error}); it must be an NPZ that `rangecheck maps` wrote") from None
 
 

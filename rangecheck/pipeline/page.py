@@ -11,7 +11,6 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
@@ -21,7 +20,7 @@ from rangecheck.errors import InputError
 from rangecheck.export.map_files import read_maps_npz
 from rangecheck.export.mapped import contour_picture
 from rangecheck.export.pictures import png_bytes
-from rangecheck.files import read_bytes, read_json, whole_file, write_bytes
+from rangecheck.files import DAMAGED_ARCHIVE, read_bytes, read_json, whole_file, write_bytes
 from rangecheck.maps import trace_maps
 from rangecheck.optics import PinholeCamera
 from rangecheck.pipeline.likeness import likeness
@@ -134,7 +133,7 @@ def _read_arrays(path: Path) -> dict[str, Any] | None:
     try:
         with np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as found:
             return dict(found)
-    except (OSError, ValueError, EOFError, BadZipFile) as error:
+    except DAMAGED_ARCHIVE as error:
         raise InputError(path, f"cannot be read ({error}); run the job again with --force") from None
 
 

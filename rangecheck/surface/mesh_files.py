@@ -10,7 +10,6 @@ from __future__ import annotations
 import io
 import re
 import zipfile
-import zlib
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,7 @@ import numpy as np
 
 from rangecheck.arrays import FloatArray, IntArray, mm_per
 from rangecheck.errors import DependencyMissing, InputError, UnitMissing
-from rangecheck.files import read_bytes
+from rangecheck.files import DAMAGED_ARCHIVE, read_bytes
 from rangecheck.surface.ply_files import Labels, ply_mesh
 from rangecheck.surface.standing import lowered_in, turned_back
 from rangecheck.surface.stl_files import stl_corners
@@ -230,7 +229,7 @@ def _refuse_to_swell(path: Path, content: bytes) -> None:
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             unpacked = sum(member.file_size for member in archive.infolist())
-    except (zipfile.BadZipFile, ValueError, OverflowError, OSError) as error:
+    except DAMAGED_ARCHIVE as error:
         raise InputError(path, f"cannot be read as 3MF ({error}); export it again") from None
     if unpacked > max(SWELLS_FREELY, MOST_SWELLING * len(content)):
         raise InputError(
@@ -244,7 +243,7 @@ def _refuse_to_multiply(path: Path, content: bytes) -> None:
     """Refuse a 3MF whose components of components place its parts more often than its reader follows; it would leave the rest out."""
     try:
         placed, inside = _parts_of(content)
-    except (zipfile.BadZipFile, zlib.error, ValueError, NotImplementedError, RuntimeError, EOFError, OSError) as error:
+    except DAMAGED_ARCHIVE as error:
         raise InputError(path, f"cannot be read as 3MF ({error}); export it again") from None
     times = 0
     for _ in range(len(inside) + 1):  # one level of components after another; a circle of them has no last

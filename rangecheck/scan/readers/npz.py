@@ -10,7 +10,6 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ import numpy.typing as npt
 from rangecheck import rigid
 from rangecheck.arrays import MM_PER_UNIT
 from rangecheck.errors import ArrayError, CameraError, InputError
-from rangecheck.files import read_bytes, write_bytes
+from rangecheck.files import DAMAGED_ARCHIVE, read_bytes, write_bytes
 from rangecheck.optics import RayGrid, camera_from_dict
 from rangecheck.scan.range_scan import RangeScan
 from rangecheck.scan.readers.limits import DEFLATE_RATIO, MAX_CELLS, check_cells, check_holds
@@ -69,7 +68,7 @@ def read_npz(path: Path, unit: str | None = None) -> list[RangeScan]:
             members = {
                 info.filename.removesuffix(".npy"): _member(path, archive, info, len(content)) for info in archive.infolist()
             }
-    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, OSError, ValueError) as error:
+    except DAMAGED_ARCHIVE as error:
         raise InputError(path, f"is a damaged NumPy archive ({error}); copy or write it again") from None
     missing = [name for name in ("schema", "description", "range_mm", "world_from_scan") if name not in members]
     if missing:
