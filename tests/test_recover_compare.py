@@ -74,6 +74,25 @@ def test_a_dent_that_the_picture_does_not_show_is_named_at_its_place_with_its_de
     assert worst.kind == "shape" and dent.amount_mm[worst.cell] == pytest.approx(1.0, abs=0.35)
 
 
+def test_the_picture_of_what_is_left_is_red_where_the_scan_lies_too_deep_and_blue_where_it_stands_too_high(clean):
+    from rangecheck.pipeline.explained import residual_picture
+
+    scan, found = clean
+    for depth, more, less in ((1.0, 0, 2), (-1.0, 2, 0)):
+        dent = compare(
+            dented(scan, scan.grid_points_mm[110, 90], depth_mm=depth, radius_mm=10.0), scale_mm=2.5, fitted=found.fitted
+        )
+        side = np.sign(dent.z[dent.regions[0].cell])
+        assert side == np.sign(depth)
+        wholly = replace(dent, z=np.where(np.isfinite(dent.z), 1.5 * side * dent.level, np.nan), regions=())
+        # without the scale at the right
+        shown = residual_picture(wholly, "ball").astype(int)[:, :700]
+        assert (shown[..., more] - shown[..., less] > 60).mean() > 0.2
+        assert not (shown[..., less] - shown[..., more] > 60).any()
+    ringed, plain = (residual_picture(replace(dent, regions=regions), "ball") for regions in (dent.regions, ()))
+    assert 100 < (ringed != plain).any(axis=2).sum() < 0.02 * plain[..., 0].size
+
+
 def test_a_step_between_two_halves_of_a_scan_is_named_on_its_line(clean):
     scan, found = clean
     ranges = scan.range_mm.copy()

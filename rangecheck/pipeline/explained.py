@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from rangecheck import rigid
-from rangecheck.arrays import FloatArray
 from rangecheck.errors import ScanError
-from rangecheck.export.pictures import write_png
+from rangecheck.export.legend import INK, PAPER, ColourScale, colours_of, font, framed, letter_px
+from rangecheck.export.pictures import Picture, write_png
 from rangecheck.optics import Sensor
 from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.subject import hashes, holds_capture, read_all_scans
@@ -33,6 +33,11 @@ _CELLS = 400_000
 _SECOND_CELLS = 900_000
 #: regions told of in lines; the document has all
 _TOLD = 12
+#: of the picture of what is left: levels to either side, greys of what was not compared, cells around, and about its longer side in pixels
+_SPAN, _FADED, _MARGIN, _SIDE = 2.0, (120.0, 235.0), 4, 720
+_MEANS = "red: the scan lies deeper than its picture shows, blue: higher, grey: not compared"
+#: share of a scan below which it is not said to be judged
+_HARDLY = 0.005
 _CODE = "scan-contradicts-picture"
 
 
@@ -113,21 +118,23 @@ def _by_shading(scan: RangeScan) -> tuple[dict[str, Any], tuple[Region, ...], li
 
 def _judged_line(name: str, found: Comparison) -> str:
     known = found.least_mm[np.isfinite(found.least_mm)]
+    compared = known.size / max(1, int(found.grid.valid.sum()))
     least = f"dents of {np.median(known):.2f} mm (median) would be named" if known.size else "nothing of it is lit well enough"
-    if found.judged == 0.0:
+    if found.judged < _HARDLY:
         return (
-            f"{name}: its brightness differs by {100 * found.paint:.1f} % from the scan's shading in structures of a dent's size (paint, or noise of the ranges), so "
-            f"that only {least}: its shape cannot be judged to {JUDGED_MM:g} mm by it"
+            f"{name}: {100 * compared:.0f} % of it could be compared, the rest is too near to rims, shadows and gaps; there its brightness differs by "
+            f"{100 * found.paint:.1f} % from the scan's shading in structures of a dent's size (paint, or noise of the ranges), so that only {least}: its shape "
+            f"cannot be judged to {JUDGED_MM:g} mm by it"
         )
     return f"{name}: {100 * found.judged:.0f} % of it judged by its brightness to {JUDGED_MM:g} mm; {least}; elsewhere paint, shadow or grazing light hide the shape"
 
 
 def _places(regions: Sequence[Region]) -> list[str]:
     lines = []
-    for region in regions[:_TOLD]:
+    for k, region in enumerate(regions[:_TOLD]):
         x, y, z = region.middle_mm
         lines.append(
-            f"  {region.kind} at {x:.1f}, {y:.1f}, {z:.1f} mm: {region.area_mm2:.0f} mm2, {region.length_mm:.0f} x {region.width_mm:.0f} mm, "
+            f"  {k + 1}: {region.kind} at {x:.1f}, {y:.1f}, {z:.1f} mm: {region.area_mm2:.0f} mm2, {region.length_mm:.0f} x {region.width_mm:.0f} mm, "
             f"z {region.z:.1f}"
         )
     if len(regions) > _TOLD:
@@ -152,10 +159,8 @@ def fit_scan(
         fit &= not any(region.kind in AGAINST_SHAPE for region in found.regions)
         if out is not None:
             name = Path(out) if len(scans) == 1 else Path(out).with_name(f"{Path(out).stem}-{scan.name}{Path(out).suffix}")
-            write_png(name, residual_picture(found), force=force)
-            lines.append(
-                f"{name}: dark where the picture shows less range than the scan, bright where more, blue where it was not compared"
-            )
+            write_png(name, residual_picture(found, scan.name), force=force)
+            lines.append(f"{name}: {_MEANS}; beyond 1 a place is named")
     return Outcome(document("explained", fit=fit, scans=results, inputs=hashes([path]), seconds=reporter.seconds), lines, fit)
 
 
@@ -191,14 +196,37 @@ def told(name: str, found: Comparison) -> list[str]:
     d = ", ".join(f"{v:.3f}" for v in light.direction)
     lines = [_judged_line(name, found), f"  lamp towards {d} (scan's frame)"]
     lines += [f"  not determined: {said}" for said in found.fitted.statements]
-    if not found.regions and found.judged > 0.0:
+    if not found.regions and found.judged >= _HARDLY:
         lines.append("  where it was judged the scan explains the picture: no place contradicts it")
     return lines + _places(found.regions)
 
 
-def residual_picture(found: Comparison) -> FloatArray:
-    """(h, w, 3) uint8: z from minus the level (black) to the level (white), grey 0; blue where not compared."""
-    level = np.clip(found.z / (2.0 * max(found.level, 1e-9)) + 0.5, 0.0, 1.0)
-    grey = np.repeat((np.nan_to_num(level) * 255.0)[..., None], 3, axis=2)
-    grey[~np.isfinite(found.z)] = (20, 30, 60)
-    return grey.astype(np.uint8)
+def residual_picture(found: Comparison, name: str) -> Picture:
+    """(H, W, 3) uint8: z of the strongest false relief in units of the level, over the scan's faded brightness where nothing was compared; places
+    that are named have a ring, and the number that they have in the list."""
+    from PIL import Image, ImageDraw
+
+    valid = found.grid.valid
+    rows, columns = (np.flatnonzero(valid.any(axis=axis)) for axis in (1, 0))
+    held = (
+        slice(max(0, rows[0] - _MARGIN), rows[-1] + 1 + _MARGIN),
+        slice(max(0, columns[0] - _MARGIN), columns[-1] + 1 + _MARGIN),
+    )
+    light = np.sqrt(np.clip(np.nan_to_num(found.grid.picture) / max(float(np.nanmax(found.grid.picture)), 1e-9), 0.0, 1.0))
+    faded = np.rint(_FADED[0] + (_FADED[1] - _FADED[0]) * light).astype(np.uint8)
+    shown = np.where(valid[..., None], faded[..., None], np.array(PAPER, np.uint8))
+    compared = np.isfinite(found.z)
+    shown = np.where(compared[..., None], colours_of(found.z / found.level, -_SPAN, _SPAN, "RdBu_r"), shown)[held]
+    times = max(1, round(_SIDE / max(shown.shape[:2])))
+    image = Image.fromarray(np.repeat(np.repeat(shown.astype(np.uint8), times, axis=0), times, axis=1))
+    draw = ImageDraw.Draw(image)
+    letters = font(letter_px(image.height))
+    for k, region in enumerate(found.regions[:_TOLD]):
+        y, x = ((at - start.start + 0.5) * times for at, start in zip(region.cell, held))
+        reach = times * (0.5 * region.length_mm / found.grid.spacing_mm + 4.0)
+        draw.ellipse((x - reach, y - reach, x + reach, y + reach), outline=INK, width=2)
+        draw.text(
+            (x + 0.8 * reach, y - 0.8 * reach), str(k + 1), font=letters, fill=INK, anchor="lb", stroke_width=2, stroke_fill=PAPER
+        )
+    scale = ColourScale(-_SPAN, _SPAN, "of level", "RdBu_r", (-1.0, 1.0))
+    return framed(np.asarray(image), f"{name}: shape against brightness", _MEANS, scale)
