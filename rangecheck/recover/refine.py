@@ -9,7 +9,10 @@ Nehab et al., *Efficiently combining positions and normals for precise 3D geomet
 Gauss-Newton with the exact derivative of the shading by the slopes; the picture's residuals by Huber's weights, which leaves out shadows' edges.
 
 bend_sd is taken per place, the smallest for which range minus heights stays noise when averaged over a few cells: where more would be taken
-away than noise can be, the surface is let bend more (Lepskii's rule). Noise of neighbours must be independent.
+away than noise can be, the surface is let bend more (Lepskii's rule). Noise of neighbours must be independent. A step between neighbours that is steeper than
+those beside it by more than noise is an edge across which nothing is smoothed, and the sooner where the picture shows its cells too bright for a slope. At
+last the heights are held against the ranges once more: where more was taken away than their noise lets expect, part of it is given back (Stein's unbiased
+estimate of the error, which needs no truth).
 
 Albedo and shape cannot be told apart by one picture at fine scale, but at coarse scale the range tells the shape: where the brightness, averaged,
 differs from what the range's own shape predicts, the surface is painted, and the picture is not used there (each cell's difference is bounded, so that
@@ -23,13 +26,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.sparse as sparse
 
 from rangecheck import rigid
 from rangecheck.arrays import BoolArray, FloatArray, IntArray
 from rangecheck.errors import ScanError
+from rangecheck.recover.balance import Balance
 from rangecheck.recover.fit import Fitted
-from rangecheck.recover.gradients import solve
 from rangecheck.recover.grid import ScanGrid, masked_gauss, scan_grid
 from rangecheck.recover.heights import HeightGrid, height_grid
 from rangecheck.recover.lamp import lamp_of
@@ -38,12 +40,6 @@ from rangecheck.scan import RangeScan
 from rangecheck.scan.noise import estimate_noise, surface_cosines
 from rangecheck.surface.surface import MEASURED, Surface
 
-#: bends of a surface, as 1/mm of curvature: the tightest prior tried, and the factor by which it is loosened where it takes too much away
-_CURVATURE, _LOOSER, _RUNGS = 1.0 / 60.0, 3.0, 9
-#: cells over which what is taken away is averaged, and how many of its standard deviations are still noise
-_WINDOW, _NOISE_SIGMAS = 1.5, 3.0
-#: mean square of it, in variances, up to which bends that alternate are still noise: with 28 cells to a window, three deviations above 1
-_MOST_ENERGY = 1.8
 #: cells over which brightness is compared with the shading of the range, and the share by which paint-free brightness may differ there
 _COARSE, _PAINT = 5.0, 0.05
 #: difference of one cell that counts at most: folds as narrow as cells differ by much, paint is all of one side
@@ -54,18 +50,21 @@ _SPECK = 0.2
 _SLOW = 30.0
 #: share of the well-lit cells that may be painted before the picture is refused
 MOST_PAINTED = 0.35
-_STEPS, _BEND = 5, 2.0
+#: weights of a cell's brightness by its own slopes, and by those of each of its links, of which there are two a cell
+_OWN_SHARE, _LINK_SHARE = 1.0, 0.5
 #: rounds in which the picture's noise is taken for larger where it strains the range, by this factor; times it from which the picture has no say
 _DOUBTS, _DOUBT, _LOST = 6, 2.0, 8.0
 #: what is taken away that is no noise of tens of thousands of windows, as _NOISE_SIGMAS and _MOST_ENERGY are of one
 _DOUBT_SIGMAS, _DOUBT_ENERGY = 4.0, 2.2
 #: share of the brightness that lamp and albedo leave uncertain
 _LAMP = 0.01
-#: between the mean of a slope over a cell and that over two, where it walks at random by one step of the prior's a cell
-_MISSED = 1.0 / np.sqrt(24.0 * _LOOSER)
-_STEEPEST, _STEP_SIGMAS = 5.7, 4.0
-#: noise of slanted cells that is believed, in that of cells seen face on
-_SLANTED = 1.25
+#: slope, as change of range by distance across, and deviations of noise above it, up to which neighbours are linked; deviations of the difference of two
+#: steps from which one that is steeper than both its neighbours is a tear
+_STEEPEST, _STEP_SIGMAS, _TORN_SIGMAS = 5.7, 4.0, 3.0
+#: deviations by which a cell is too bright for its slope, and those of steps from which one beside such a cell is a tear
+_BRIGHTER, _TORN_SIGMAS_FLAT = 3.0, 0.5
+#: noise of slanted cells that is believed, in that of cells seen face on: at slants over seven cells, and at the refined surface's own
+_SLANTED, _OWN_SLANTED = 1.25, 1.5
 _LEAST_LIGHT, _LEAST_COSINE = 0.25, 0.2
 
 
@@ -100,14 +99,23 @@ def refine(scan: RangeScan, *, fitted: Fitted | None = None, noise_mm: float | N
     heights = _heights(scan, grid, noise)
     measured = np.log(scan.range_mm.astype(float)).reshape(-1)[heights.cell]
     sigma = (noise / scan.range_mm).reshape(-1)[heights.cell]
-    model = _Model(heights, measured, sigma, _bend_unit(grid, heights))
+    model = Balance(heights, measured, sigma, _bend_unit(grid, heights))
     q = model.settle()
     if not use_picture:
+        q = model.trusted(q, _own_noise(scan, heights, q, noise_mm))
         return _done(scan, heights, q, np.zeros(0, int), np.zeros(0, int), noise, 0.0, None)
-    smooth = replace(grid, points=heights.spread(np.exp(q)[:, None] * heights.rays))
-    normals, _, _ = heights.normals(q)
+    smooth = replace(grid, points=heights.spread(np.exp(q))[..., None] * grid.rays)
+    normals, _, _ = heights.slopes.normals(q)
     fitted = fitted or lamp_of(smooth, heights.cell[heights.inner], normals)
     shading = shading_of(fitted, smooth, heights.cell[heights.inner])
+    flat = _flat_by_picture(model, heights, shading, grid, normals, q)
+    if flat.any():
+        heights = _heights(scan, grid, noise, flat)
+        model = model.on(heights, _bend_unit(grid, heights))
+        q = model.settle()
+        smooth = replace(grid, points=heights.spread(np.exp(q))[..., None] * grid.rays)
+        normals, _, _ = heights.slopes.normals(q)
+        shading = shading_of(fitted, smooth, heights.cell[heights.inner])
     believed, painted, albedo, spread = _believed(heights, shading, grid, normals)
     lit = int(believed.sum() + painted.sum())
     if lit == 0:
@@ -119,11 +127,15 @@ def refine(scan: RangeScan, *, fitted: Fitted | None = None, noise_mm: float | N
             "use the scan unrefined",
             name=scan.name, painted=float(painted.sum() / lit),
         )  # fmt: skip
-    # a lamp and an albedo are not known better than a few per cent, a cell's own slope not better than its surface bends
-    known = np.hypot(np.hypot(spread, _LAMP * shading.seen), model.unseen(q, shading, albedo))
-    noise_seen = known
+    # a lamp and an albedo are not known better than a few per cent
+    noise_seen = known = np.hypot(spread, _LAMP * shading.seen)
+    shading = replace(shading, seen=shading.seen / albedo)
+    looks = [
+        model.look(q, heights.slopes, shading, np.arange(len(albedo))[:, None], _OWN_SHARE),
+        model.look(q, heights.between, shading.between(heights.ends), heights.ends, _LINK_SHARE),
+    ]
     for _ in range(_DOUBTS):
-        q = model.with_picture(q, shading, believed, albedo, noise_seen)
+        q = model.with_picture(q, looks, believed, noise_seen)
         # where picture and range cannot both be right within their noise the picture is believed less: folds as narrow as cells, rims of paint
         doubted = model.strained(q, _DOUBT_SIGMAS, _DOUBT_ENERGY)[heights.inner] & believed
         if not doubted.any():
@@ -131,7 +143,8 @@ def refine(scan: RangeScan, *, fitted: Fitted | None = None, noise_mm: float | N
         noise_seen = np.where(doubted, _DOUBT * noise_seen, noise_seen)
     else:
         believed, painted = believed & ~doubted, painted | doubted
-        q = model.with_picture(q, shading, believed, albedo, noise_seen)
+        q = model.with_picture(q, looks, believed, noise_seen)
+    q = model.trusted(q, _own_noise(scan, heights, q, noise_mm))
     lost = believed & (noise_seen > _LOST * known)
     believed, painted = believed & ~lost, painted | lost
     return _done(scan, heights, q, heights.inner[believed], heights.inner[painted], noise, spread, fitted)
@@ -140,12 +153,31 @@ def refine(scan: RangeScan, *, fitted: Fitted | None = None, noise_mm: float | N
 def linked(scan: RangeScan, noise_mm: FloatArray) -> BoolArray:
     """(h, w) cells whose four neighbours returned and lie on the same surface. noise_mm (h, w): of range."""
     heights = _heights(scan, scan_grid(scan), noise_mm)
-    return np.asarray(np.isin(np.arange(scan.range_mm.size), heights.cell[heights.inner]).reshape(scan.range_mm.shape))
+    return np.asarray(
+        np.isin(np.arange(scan.range_mm.size), heights.cell[heights.inner[heights.whole]]).reshape(scan.range_mm.shape)
+    )
 
 
-def _heights(scan: RangeScan, grid: ScanGrid, noise: FloatArray) -> HeightGrid:
+def _flat_by_picture(
+    model: Balance, heights: HeightGrid, shading: Shading, grid: ScanGrid, normals: FloatArray, q: FloatArray
+) -> BoolArray:
+    """(h, w) cells that are brighter than they could be at their slopes over the links: a step between two of them is no slope."""
+    _, _, albedo, spread = _believed(heights, shading, grid, normals)
+    even = replace(shading, seen=shading.seen / albedo)
+    unseen = model.look(q, heights.slopes, even, np.arange(len(albedo))[:, None], 1.0).unseen
+    predicted, _ = even.at(normals)
+    deviation = np.hypot(np.hypot(spread, _LAMP * shading.seen), unseen)
+    flat = np.zeros(heights.shape[0] * heights.shape[1], bool)
+    flat[heights.cell[heights.inner]] = even.seen - predicted > _BRIGHTER * deviation
+    return flat.reshape(heights.shape)
+
+
+def _heights(scan: RangeScan, grid: ScanGrid, noise: FloatArray, flat: BoolArray | None = None) -> HeightGrid:
     ranges = np.where(grid.valid, scan.range_mm, np.nan).astype(float)
-    return height_grid(ranges, grid.rays, _STEEPEST, _STEP_SIGMAS * noise / np.nan_to_num(scan.range_mm, nan=1.0))
+    share = noise / np.nan_to_num(scan.range_mm, nan=1.0)
+    sigmas = _TORN_SIGMAS if flat is None else np.where(flat, _TORN_SIGMAS_FLAT, _TORN_SIGMAS)
+    torn = sigmas * np.sqrt(6.0) * share
+    return height_grid(ranges, grid.rays, _STEEPEST, _STEP_SIGMAS * share, torn)
 
 
 def _noise(scan: RangeScan, noise_mm: float | None) -> FloatArray:
@@ -159,87 +191,25 @@ def _noise(scan: RangeScan, noise_mm: float | None) -> FloatArray:
     return np.minimum(found.sigma_mm(ranges, np.nan_to_num(cosine, nan=1.0)), _SLANTED * found.sigma_mm(ranges))
 
 
+def _own_noise(scan: RangeScan, heights: HeightGrid, q: FloatArray, noise_mm: float | None) -> FloatArray:
+    """(n,) standard deviation of ln range at the slants of the refined surface itself, which folds do not make steeper than it is."""
+    cells = heights.cell
+    ranges = scan.range_mm.reshape(-1)[cells].astype(float)
+    if noise_mm is not None:
+        return np.asarray(noise_mm / ranges)
+    found = estimate_noise(scan)
+    normals, _, _ = heights.slopes.normals(q)
+    cosine = np.full(len(cells), np.nan)
+    cosine[heights.inner] = -(normals * heights.slopes.rays).sum(1)
+    facing = found.sigma_mm(ranges)
+    slanted = np.where(np.isfinite(cosine), found.sigma_mm(ranges, cosine), _SLANTED * facing)
+    return np.asarray(np.minimum(slanted, _OWN_SLANTED * facing) / ranges)
+
+
 def _bend_unit(grid: ScanGrid, heights: HeightGrid) -> FloatArray:
     """Second difference of q of a surface of curvature 1/mm seen face on, per bend."""
     ranges = np.linalg.norm(grid.points.reshape(-1, 3)[heights.cell], axis=1)
-    spacing = np.linalg.norm(heights.ray_u, axis=1) * np.linalg.norm(heights.ray_v, axis=1) * ranges
-    return np.asarray(spacing[heights.bend_cell])
-
-
-class _Model:
-    """The sum of squares and its least."""
-
-    def __init__(self, heights: HeightGrid, measured: FloatArray, sigma: FloatArray, bend_unit: FloatArray) -> None:
-        self.heights, self.measured, self.sigma, self.bend_unit = heights, measured, sigma, bend_unit
-        self.curvature: FloatArray = np.full(len(measured), _CURVATURE)
-        self.data = sparse.diags_array(1.0 / sigma**2)
-
-    def _prior(self) -> sparse.csr_array:
-        weight = 1.0 / (self.curvature[self.heights.bend_cell] * self.bend_unit)
-        rows = sparse.diags_array(weight) @ self.heights.bend
-        return sparse.csr_array(self.data + rows.T @ rows)
-
-    def settle(self) -> FloatArray:
-        """Heights of least range and bends, the bends loosened where they take away more than noise."""
-        q = self.measured
-        for _ in range(_RUNGS):
-            self.matrix = self._prior()
-            q = solve(self.matrix, self.measured / self.sigma**2, q, self.sigma)
-            strained = self.strained(q)
-            if not strained.any():
-                break
-            self.curvature = np.where(strained, self.curvature * _LOOSER, self.curvature)
-        self.matrix = self._prior()
-        return solve(self.matrix, self.measured / self.sigma**2, q, self.sigma)
-
-    def strained(self, q: FloatArray, sigmas: float = _NOISE_SIGMAS, most: float = _MOST_ENERGY) -> BoolArray:
-        """(n,) cells around which what was taken away is no noise."""
-        from scipy.ndimage import maximum_filter
-
-        ones = self.heights.spread(np.ones(len(q)), 0.0)
-        taken = self.heights.spread((q - self.measured) / self.sigma, 0.0)
-        # mean over a Gaussian window has 1 / (2 sqrt(pi) w) of the noise of one cell
-        away = np.nan_to_num(masked_gauss(taken, ones, _WINDOW)) * 2.0 * np.sqrt(np.pi) * _WINDOW
-        energy = np.nan_to_num(masked_gauss(taken * taken, ones, _WINDOW))
-        odd = (np.abs(away) > sigmas) | (energy > most)
-        near = maximum_filter(odd.astype(np.uint8), size=2 * round(_WINDOW) + 1)
-        return np.asarray(near.reshape(-1)[self.heights.cell] > 0)
-
-    def unseen(self, q: FloatArray, shading: Shading, albedo: FloatArray) -> FloatArray:
-        """(m,) standard deviation of brightness that comes of bends within a cell, where the grid knows only the difference across it.
-
-        Bends of standard deviation s a cell are slopes that walk at random: their mean over a pixel, which the picture has, and that over the
-        two cells of a central difference are s / sqrt(24) apart. The prior's bends, found in steps of `_LOOSER`, are too large by its root in the middle."""
-        normals, slope_u, slope_v = self.heights.normals(q)
-        _, by_normal = shading.at(normals)
-        unit = np.zeros(len(q))
-        unit[self.heights.bend_cell] = self.bend_unit
-        missed = _MISSED * (self.curvature * unit)[self.heights.inner]
-        return np.asarray(albedo * missed * np.hypot((by_normal * slope_u).sum(1), (by_normal * slope_v).sum(1)))
-
-    def with_picture(
-        self, q: FloatArray, shading: Shading, believed: BoolArray, albedo: FloatArray, noise: FloatArray
-    ) -> FloatArray:
-        """Gauss-Newton from `q` with the picture's residuals of the believed inner cells."""
-        heights = self.heights
-        noise = noise[believed]
-        for _ in range(_STEPS):
-            normals, slope_u, slope_v = heights.normals(q)
-            value, by_normal = shading.at(normals)
-            r = (albedo * value - shading.seen)[believed] / noise
-            weight = np.minimum(1.0, _BEND / np.maximum(np.abs(r), 1e-9))
-            a = ((albedo * (by_normal * slope_u).sum(1))[believed] / noise)[:, None]
-            b = ((albedo * (by_normal * slope_v).sum(1))[believed] / noise)[:, None]
-            rows = heights.by_u[believed].multiply(a) + heights.by_v[believed].multiply(b)
-            rows = sparse.csr_array(rows)
-            matrix = sparse.csr_array(self.matrix + rows.T @ (sparse.diags_array(weight) @ rows))
-            right = self.measured / self.sigma**2 + rows.T @ (weight * (rows @ q - r))
-            moved = solve(matrix, right, q, self.sigma)
-            step = float(np.max(np.abs(moved - q) / self.sigma))
-            q = moved
-            if step < 0.02:
-                break
-        return q
+    return np.asarray((heights.spacing * ranges)[heights.bend_cell])
 
 
 def _believed(
@@ -250,7 +220,7 @@ def _believed(
 
     seen = shading.seen
     predicted, _ = shading.at(normals)
-    facing = -(normals * heights.rays[heights.inner]).sum(1)
+    facing = -(normals * heights.slopes.rays).sum(1)
     bright = _LEAST_LIGHT * float(np.quantile(predicted, 0.95))
     lit = (predicted > bright) & (facing > _LEAST_COSINE) & (seen > 0.2 * bright) & (seen < shading.saturation)
     cell = heights.cell[heights.inner]

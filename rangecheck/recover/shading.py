@@ -27,6 +27,15 @@ class Shading:
         there = replace(self.problem, photographs=(replace(photo, sight=sight),))
         return there.by_normal(0)
 
+    def only(self, keep: IntArray) -> Shading:
+        """Of the cells `keep` (k,), among the m."""
+        photo = self.problem.photographs[0].only(keep)
+        return replace(self, problem=replace(self.problem, photographs=(photo,)), seen=self.seen[keep])
+
+    def between(self, ends: IntArray) -> Shading:
+        """Halfway between two neighbours, `ends` (k, 2) among the m: the mean of what is seen of both, in the place of the first."""
+        return replace(self.only(ends[:, 0]), seen=self.seen[ends].mean(axis=1))
+
 
 def shading_of(fitted: Fitted, grid: ScanGrid, cell: IntArray) -> Shading:
     """For cells (m,) of the flattened grid."""

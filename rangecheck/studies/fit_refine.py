@@ -1,10 +1,11 @@
 """Shape refined by shading, against truth: slopes and heights of the sample bust's scans before and after, clean and painted.
 
-The sample range finder (0.2 mm of noise, 640 x 480) sees the bust from three sides; its picture has 1 % of full scale of Gaussian noise. Errors of slope are
+The sample range finder (0.2 mm of noise, 640 x 480) sees the bust from four sides; its picture has 1 % of full scale of Gaussian noise. Errors of slope are
 angles to the true normal. Slopes of all cells are differences to their neighbours on the same surface, which truth tells (`slopes`): a difference across a
 depth step is no slope. The cells are those between four that returned, and, told apart, those at rims too. Beside them stand central differences whatever lies
 between the neighbours, of the same cells, and of those whose neighbours the ranges themselves put on one surface. Where folds are as narrow as cells even the true ranges' differences miss the true normals: by how much is said too.
-Heights are compared in windows of 16 x 16 cells, wherever a quarter of them is measured. The seeds are none that the method was made on.
+Heights are compared in windows of 16 x 16 cells, wherever a quarter of them is measured: the rms error of such a window, 64 to 256 cells, scatters by 9 to 4 %
+by itself, and after over before by less, as both share some noise. The seeds are none that the method was made on.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from rangecheck.study import Line, LineChart
 #: share of light that the bust gives back, and noise of its picture
 ALBEDO, PICTURE_NOISE = 0.7, 0.01
 _WINDOW = 16
-_FRESH = 94200
+_FRESH = 97300
 
 
 def bust_picture(azimuth_deg: float, seed: int, *, spots: int = 0, step: int = 1) -> tuple[SimulatedScan, RangeScan]:
@@ -116,7 +117,7 @@ def refinement(quick: bool) -> tuple[list[Any], list[str], list[dict[str, Any]]]
     from rangecheck.raycast.implicit import ImplicitCaster
 
     step = 2 if quick else 1
-    cases = [(20.0, 0), (20.0, 3)] if quick else [(20.0, 0), (20.0, 3), (20.0, 40), (-60.0, 0), (100.0, 0)]
+    cases = [(20.0, 0), (20.0, 3)] if quick else [(20.0, 0), (20.0, 3), (20.0, 40), (-60.0, 0), (100.0, 0), (250.0, 0)]
     rows: list[dict[str, Any]] = []
     findings: list[str] = []
     for azimuth, spots in cases:
