@@ -177,6 +177,21 @@ def test_a_study_is_written_as_pictures_and_one_document_that_json_allows(tmp_pa
         write_study(a_study(), tmp_path / "out", force=False)
 
 
+def test_a_short_logarithmic_axis_reads_in_plain_numbers():
+    from matplotlib.figure import Figure
+
+    from rangecheck.study.drawing import _scales
+
+    for values, expected in (([4.0, 12.0], {"4", "5", "6", "8", "10"}), ([1e-9, 1.0], set())):
+        axes = Figure().add_subplot()
+        axes.plot(values, values)
+        _scales(axes, "xy")
+        axes.figure.canvas.draw()
+        for axis in (axes.xaxis, axes.yaxis):
+            shown = {label.get_text() for label in axis.get_ticklabels()}
+            assert expected <= shown and any("10^" in text for text in shown) is not bool(expected)
+
+
 def test_the_same_numbers_give_the_same_bytes():
     study = a_study()
     assert draw(study.charts[0], study.machine) == draw(study.charts[0], study.machine)

@@ -13,6 +13,8 @@ from rangecheck.study.speed import pareto_front
 #: Okabe and Ito's eight colours, told apart by nearly everybody; black last
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C6D1F", "#000000")
 _MARKERS = "osD^vPX*"
+#: logarithmic axes within these are numbered plainly
+_EVERYDAY = (1e-4, 1e5)
 
 
 def draw(chart: Chart, machine: dict[str, Any], kind: str = "svg") -> bytes:
@@ -61,9 +63,8 @@ def _draw_speed(axes: Any, chart: SpeedChart) -> None:
         [chart.times(m)[1] for m in front], [max(m.error, floor) for m in front],
         where="post", color="0.5", linewidth=1, linestyle="--", zorder=0, label="not beaten in both",
     )  # fmt: skip
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    axes.set_xlabel(f"{chart.time_label}; median, bars are quartiles")
+    _scales(axes, "xy")
+    axes.set_xlabel(f"time, {chart.time_label} (median; bars are quartiles)")
     axes.set_ylabel(chart.error_label)
     axes.legend(loc="best", fontsize=8.5)
 
@@ -118,7 +119,20 @@ def _draw_lines(axes: Any, chart: LineChart) -> None:
 
 
 def _scales(axes: Any, log: str) -> None:
-    if "x" in log:
-        axes.set_xscale("log")
-    if "y" in log:
-        axes.set_yscale("log")
+    for name, axis in (("x", axes.xaxis), ("y", axes.yaxis)):
+        if name in log:
+            axes.set(**{f"{name}scale": "log"})
+            _number_plainly(axis)
+
+
+def _number_plainly(axis: Any) -> None:
+    """On a logarithmic axis of everyday numbers ticks read 2 and 0.05, not powers of ten; on a short one there are enough of them."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    low, high = axis.get_view_interval()
+    if not _EVERYDAY[0] <= low < high <= _EVERYDAY[1]:
+        return
+    decades = math.log10(high / low)
+    axis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 4, 5, 6, 8) if decades < 1 else (1, 2, 5) if decades < 2.5 else (1,)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
