@@ -133,6 +133,7 @@ def _number_plainly(axis: Any) -> None:
     if not _EVERYDAY[0] <= low < high <= _EVERYDAY[1]:
         return
     decades = math.log10(high / low)
-    axis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 4, 5, 6, 8) if decades < 1 else (1, 2, 5) if decades < 2.5 else (1,)))
+    steps = {0.4: (1, 1.1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9), 1.0: (1, 1.5, 2, 3, 4, 5, 6, 8), 2.5: (1, 2, 5)}
+    axis.set_major_locator(LogLocator(subs=next((subs for most, subs in steps.items() if decades < most), (1,))))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
