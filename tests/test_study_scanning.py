@@ -4,11 +4,12 @@ import math
 import os
 import signal
 from functools import partial
+from importlib import import_module
 
 import numpy as np
 import pytest
 
-from rangecheck.errors import InputError
+from rangecheck.errors import DependencyMissing, InputError
 from rangecheck.scan.registration import register
 from rangecheck.studies import study_named
 from rangecheck.studies.bust_scans import bust_ring, bust_views, near_samples, real_data
@@ -86,6 +87,11 @@ def _crashes(scans):
 
 def _face(scans):
     return Surface(scans[0].points_mm()[:3], np.array([[0, 1, 2]], np.int32))
+
+
+def test_a_method_whose_engine_is_not_installed_names_what_mends_it(views):
+    with Apart(views) as apart, pytest.raises(DependencyMissing, match=r"no_such_engine .*pip install 'rangecheck\[engines\]'"):
+        apart.run(partial(import_module, "no_such_engine"))
 
 
 def test_a_method_that_crashes_is_told_and_the_others_go_on(views):

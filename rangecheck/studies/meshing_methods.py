@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from rangecheck.arrays import FloatArray, IntArray
+from rangecheck.errors import DependencyMissing
 from rangecheck.scan import RangeScan
 from rangecheck.study import Timed
 from rangecheck.surface.meshing import fuse, pivot
@@ -80,7 +81,8 @@ class Apart:
         self._pool: ProcessPoolExecutor | None = None
 
     def run(self, make: Method, scans: Sequence[RangeScan] | None = None) -> Timed:
-        """The surface of `scans`, else of those held, and the seconds that took; None and nan where the process ended over it."""
+        """The surface of `scans`, else of those held, and the seconds that took; None and nan where the process ended over it.
+        Raises DependencyMissing where the method's engine is not installed."""
         if self._pool is None:
             self._pool = ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=_hold, initargs=(self.scans,))
         try:
@@ -88,6 +90,9 @@ class Apart:
         except BrokenProcessPool:
             self.close()
             return Timed(None, math.nan)
+        except ImportError as absent:
+            engine = absent.name or "an engine"
+            raise DependencyMissing(engine, "comparison of meshing methods", "pip install 'rangecheck[engines]'") from None
         return Timed(Surface(*found.result), found.seconds)
 
     def close(self) -> None:

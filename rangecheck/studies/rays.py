@@ -96,7 +96,7 @@ def _open3d(vertices: FloatArray, faces: IntArray) -> Engine:
     try:
         import open3d
     except ImportError:
-        raise DependencyMissing("open3d", "comparison of ray engines", "pip install open3d") from None
+        raise DependencyMissing("open3d", "comparison of ray engines", "pip install 'rangecheck[engines]'") from None
     o3d: Any = open3d
     scene = o3d.t.geometry.RaycastingScene(nthreads=thread_count())
     scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(faces.astype(np.uint32)))
