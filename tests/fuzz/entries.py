@@ -131,7 +131,8 @@ def documents(folder: Path) -> list[Entry]:
     frames = (folder / "good_frames" / "frames.json").read_bytes()
     write_scans(folder / "good_scans", [RangeScan(np.full((11, 14), 400.0), CAMERA, name="p")], step_mm=0.02)
     scans = json.loads((folder / "good_scans" / "scans.json").read_bytes())
-    scans["scans"][0] |= {"image": "p.png", "brightness": None}
+    (folder / "fuzzed" / "depth.png").write_bytes(_png(np.full((11, 14), 20_000, np.uint16)))
+    scans["scans"][0] |= {"image": "depth.png", "brightness": None}
     return [
         Entry(read_camera_json, "a.camera.json", (camera,)),
         Entry(lambda path: read_capture(path.parent), "capture.json", (json.dumps(capture).encode(),)),

@@ -70,7 +70,7 @@ def feed(group: str, folder: Path, count: int, seed: int) -> None:
             kept = folder / f"wrong_{len(wrong)}_{entry.name}"
             kept.write_bytes(content)
             wrong[f"{entry.name}: {fault}"] = str(kept)
-        path.unlink()
+        path.unlink(missing_ok=True)  # a job that is taken up takes its mark away
     print(f"{group}, {count} inputs of seed {seed}: {told}")
     if wrong:
         sys.exit("\n".join(f"{fault} ({kept})" for fault, kept in wrong.items()))
