@@ -30,9 +30,8 @@ _STEPS, _BEND = 5, 2.0
 #: of the prior's bends, found in steps of `_LOOSER` and so too large by its root in the middle, the part that slopes miss; times it at rims, where
 #: slopes are one-sided and surfaces turn away from the view
 _MISSED, _RIM = 1.0 / np.sqrt(24.0 * _LOOSER), 4.0
-#: cells over which heights are held against the range again (113 to a window), random signs that tell the influence of a cell on itself, and what is
-#: taken away that is still trusted, in the share that is best: an energy of 113 cells is that uncertain by two deviations
-_TRUST_WINDOW, _PROBES, _TRUSTED = 3.0, 2, 1.25
+#: cells over which heights are held against the range again (113 to a window), and random signs that tell the influence of a cell on itself
+_TRUST_WINDOW, _PROBES = 3.0, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +136,7 @@ class Balance:
 
         With y measured, its variance 1, d the influence of a cell on itself and e the mean square of q - y, the mean square error of y + t (q - y) is expected to
         be 1 + t^2 e - 2 t (1 - d) whatever the surface (Stein, *Estimation of the mean of a multivariate normal distribution*, 1981): least at
-        t = (1 - d) / e, and no more than that of y up to twice this t. d comes of random signs (Ramani, Blu and Unser, *Monte-Carlo SURE*, 2008)."""
+        t = (1 - d) / e. d comes of random signs (Ramani, Blu and Unser, *Monte-Carlo SURE*, 2008)."""
         heights, rng = self.heights, np.random.default_rng(0)
         influence = np.zeros(len(q))
         for _ in range(_PROBES):
@@ -150,5 +149,5 @@ class Balance:
             return np.asarray(masked_gauss(heights.spread(values, 0.0), ones, _TRUST_WINDOW).reshape(-1)[heights.cell])
 
         expected = mean(noise**2 * (1.0 - influence))
-        share = np.clip(_TRUSTED * expected / np.maximum(mean((q - self.measured) ** 2), 1e-300), 0.0, 1.0)
+        share = np.clip(expected / np.maximum(mean((q - self.measured) ** 2), 1e-300), 0.0, 1.0)
         return np.asarray(self.measured + share * (q - self.measured))

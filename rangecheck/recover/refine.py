@@ -63,8 +63,9 @@ _LAMP = 0.01
 _STEEPEST, _STEP_SIGMAS, _TORN_SIGMAS = 5.7, 4.0, 3.0
 #: deviations by which a cell is too bright for its slope, and those of steps from which one beside such a cell is a tear
 _BRIGHTER, _TORN_SIGMAS_FLAT = 3.0, 0.5
-#: noise of slanted cells that is believed, in that of cells seen face on: at slants over seven cells, and at the refined surface's own
-_SLANTED, _OWN_SLANTED = 1.25, 1.5
+#: noise of slanted cells that is believed, in that of cells seen face on, at slants over seven cells; cells over which the refined surface's own slant is
+#: averaged
+_SLANTED, _OWN_SLANT = 1.25, 3.0
 _LEAST_LIGHT, _LEAST_COSINE = 0.25, 0.2
 
 
@@ -192,18 +193,20 @@ def _noise(scan: RangeScan, noise_mm: float | None) -> FloatArray:
 
 
 def _own_noise(scan: RangeScan, heights: HeightGrid, q: FloatArray, noise_mm: float | None) -> FloatArray:
-    """(n,) standard deviation of ln range at the slants of the refined surface itself, which folds do not make steeper than it is."""
+    """(n,) standard deviation of ln range at the slants of the refined surface itself, which folds do not make steeper than it is.
+
+    Averaged over a few cells: one cell's slant is steeper by what errs in it, and where more was smoothed away than noise, noise would seem larger."""
     cells = heights.cell
     ranges = scan.range_mm.reshape(-1)[cells].astype(float)
     if noise_mm is not None:
         return np.asarray(noise_mm / ranges)
     found = estimate_noise(scan)
     normals, _, _ = heights.slopes.normals(q)
-    cosine = np.full(len(cells), np.nan)
-    cosine[heights.inner] = -(normals * heights.slopes.rays).sum(1)
-    facing = found.sigma_mm(ranges)
-    slanted = np.where(np.isfinite(cosine), found.sigma_mm(ranges, cosine), _SLANTED * facing)
-    return np.asarray(np.minimum(slanted, _OWN_SLANTED * facing) / ranges)
+    one, weight = np.zeros(len(cells)), np.zeros(len(cells))
+    one[heights.inner], weight[heights.inner] = -(normals * heights.slopes.rays).sum(1), 1.0
+    cosine = masked_gauss(heights.spread(one, 0.0), heights.spread(weight, 0.0), _OWN_SLANT).reshape(-1)[cells]
+    slanted = np.where(np.isfinite(cosine), found.sigma_mm(ranges, cosine), _SLANTED * found.sigma_mm(ranges))
+    return np.asarray(slanted / ranges)
 
 
 def _bend_unit(grid: ScanGrid, heights: HeightGrid) -> FloatArray:
