@@ -21,6 +21,7 @@ import click
 from rangecheck import progress
 from rangecheck.progress import Reporter
 
+from .completing import among, assignments, shipped
 from .memory import bound_memory
 
 if TYPE_CHECKING:
@@ -64,17 +65,6 @@ class Point(click.ParamType):
         return x, y, z
 
 
-def shipped(kind: str) -> Callable[..., list[str]]:
-    """Completes names of the shipped files of a kind: materials, printers, jobs."""
-
-    def complete(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
-        from rangecheck.files import presets_folder
-
-        return sorted(path.stem for path in (presets_folder() / kind).glob("*.toml") if path.stem.startswith(incomplete))
-
-    return complete
-
-
 _OPTIONS: dict[str, Callable[..., Any]] = {
     "unit": click.option("--unit", type=click.Choice(UNITS), help="Unit of length of inputs that do not say theirs."),
     "out": click.option("--out", "out", type=click.Path(), required=True, metavar="DIR", help="Folder for the results."),
@@ -103,14 +93,24 @@ _OPTIONS: dict[str, Callable[..., Any]] = {
         "--threads", type=click.IntRange(0), help="Threads to use; results do not depend on it. 0: all cores."
     ),
     "seed": click.option("--seed", type=click.IntRange(0), help="Seed of every random number."),
-    "config": click.option("--config", metavar="FILE", help="Settings: a TOML file or a preset (quick, normal, fine)."),
+    "config": click.option(
+        "--config",
+        metavar="FILE",
+        shell_complete=shipped("jobs"),
+        help="Settings: a TOML file or a preset (quick, normal, fine).",
+    ),
     "preset": click.option(
         "--preset",
         type=click.Choice(["quick", "normal", "fine"]),
         help="Settings to start from; --config and --set go over them.",
     ),
     "set": click.option(
-        "--set", "assignments", multiple=True, metavar="KEY=VALUE", help="One setting, for example turntable.frames=72."
+        "--set",
+        "assignments",
+        multiple=True,
+        metavar="KEY=VALUE",
+        shell_complete=among(assignments),
+        help="One setting, for example turntable.frames=72.",
     ),
     "register": click.option(
         "--register",

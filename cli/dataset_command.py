@@ -3,12 +3,18 @@
 import click
 
 from .common import common, settings_from
+from .completing import shipped
 
 
 @click.command("dataset", short_help="Many pictures with their truth over sampled parameters, for vision research.")
 @click.argument("model", type=click.Path())
 @click.option("--count", type=click.IntRange(1), default=1000, show_default=True, help="How many pictures.")
-@click.option("--ranges", metavar="FILE", help="What varies, in TOML; without it configs/datasets/default.toml.")
+@click.option(
+    "--ranges",
+    metavar="FILE",
+    shell_complete=shipped("datasets"),
+    help="What varies, in TOML; without it configs/datasets/default.toml.",
+)
 @click.option("--scheduler", metavar="ADDRESS", help="Make the pictures on a dask cluster, for example tcp://10.0.0.1:8786.")
 @common("dry_run", "out_dir", "unit", "size", "seed", "config", "set", "force")
 def command(model, count, ranges, scheduler, out, unit, size, seed, config, assignments, force, dry_run, reporter):

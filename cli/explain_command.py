@@ -3,16 +3,11 @@
 import click
 
 from .common import common
-
-
-def _codes(ctx, param, incomplete):
-    from rangecheck.files import presets_folder, read_toml
-
-    return sorted(code for code in read_toml(presets_folder() / "findings.toml") if code.startswith(incomplete))
+from .completing import among, codes
 
 
 @click.command("explain", short_help="Say what a finding means, why it matters and what mends it.")
-@click.argument("code", required=False, shell_complete=_codes)
+@click.argument("code", required=False, shell_complete=among(codes))
 @common()
 def command(code, reporter):
     """Say what a finding means, why it matters and what mends it. Without CODE, list all codes."""

@@ -3,10 +3,11 @@
 import click
 
 from .common import common
+from .completing import among, schemas
 
 
 @click.command("schema", short_help="Print the JSON Schema of a document, or of the settings.")
-@click.argument("name", required=False)
+@click.argument("name", required=False, shell_complete=among(schemas))
 @common()
 def command(name, reporter):
     """Print the JSON Schema of a document, or of the settings. Without NAME, list what there is.

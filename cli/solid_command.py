@@ -3,6 +3,7 @@
 import click
 
 from .common import common, settings_from
+from .completing import shipped
 
 
 class Plane(click.ParamType):
@@ -69,7 +70,12 @@ class Simplify(click.ParamType):
 @click.option(
     "--file-up", type=click.Choice(["z", "scan"]), help="z: STL and 3MF stand as slicers take them; scan: y up, as scanned."
 )
-@click.option("--printer", metavar="NAME", help="Judge it for printing by a profile of configs/printers, or a profile file.")
+@click.option(
+    "--printer",
+    metavar="NAME",
+    shell_complete=shipped("printers"),
+    help="Judge it for printing by a profile of configs/printers, or a profile file.",
+)
 @click.option("--orient", is_flag=True, help="Advise which way up to print: islands, overhang, largest layer, height.")
 @click.option("--ascii", is_flag=True, help="STL as text.")
 @click.option("--force-open", is_flag=True, help="Write STL even of what is no solid.")

@@ -3,17 +3,12 @@
 import click
 
 from .common import common
-
-
-def _studies(ctx, param, incomplete):
-    from rangecheck.studies import STUDIES
-
-    return sorted(name for name in (*STUDIES, "job") if name.startswith(incomplete))
+from .completing import among, parts, studies
 
 
 @click.command("study", short_help="Chart speed against accuracy, and find where methods break.")
-@click.argument("what", metavar="NAME", shell_complete=_studies)
-@click.option("--part", metavar="PART", help="Only this part of the study.")
+@click.argument("what", metavar="NAME", shell_complete=among(studies))
+@click.option("--part", metavar="PART", shell_complete=among(parts), help="Only this part of the study.")
 @click.option("--quick", is_flag=True, help="Fewer points and repeats: a first look.")
 @common("out_dir", "force")
 def command(what, part, quick, out, force, reporter):

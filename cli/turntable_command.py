@@ -2,7 +2,8 @@
 
 import click
 
-from .common import common, settings_from, shipped
+from .common import common, settings_from
+from .completing import shipped
 
 
 @click.command("turntable", short_help="Frames and video of an orbit; resumes where it was stopped.")

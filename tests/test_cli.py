@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import click
 import numpy as np
 import pytest
-from rangecheck_cli.main import COMMANDS, exit_status
+from rangecheck_cli.main import COMMANDS, cli, exit_status
 
 from rangecheck.config import load_settings
 
@@ -186,6 +186,37 @@ def test_shells_complete_options_and_the_names_of_what_there_is(words, completed
     with pytest.raises(SystemExit):
         importlib.import_module("rangecheck_cli.main").cli.main(prog_name="rangecheck")
     assert f"plain,{completed}" in capsys.readouterr().out.splitlines()
+
+
+@pytest.mark.parametrize(
+    ("words", "begun", "completed"),
+    [
+        ("check x.stl --printer", "prusa", {"prusa-sl1", "prusa-sl1s"}),
+        ("solid x.stl --printer", "l", {"large-sla"}),
+        ("check x.ply --profile", "", {"bust-75", "bust-150", "bust-300"}),
+        ("run x --set", "turntable.fr", {"turntable.frames=", "turntable.frame_format="}),
+        ("run x --set", "se", {"seed=", "sensor."}),
+        ("render x.ply --config", "", {"quick", "normal", "fine"}),
+        ("schema", "cam", {"camera", "cameras"}),
+        ("materials", "steel_", {"steel_ground", "steel_satin"}),
+        ("dataset x.toml --ranges", "d", {"default"}),
+        ("study rays --part", "", {"engines", "chunks"}),
+        ("study job --part", "n", {"normal"}),
+        ("study nothing --part", "", set()),
+        ("study --part", "", set()),
+    ],
+)
+def test_what_can_be_named_is_completed(words, begun, completed):
+    from click.shell_completion import ShellComplete
+
+    items = ShellComplete(cli, {}, "rangecheck", "_RANGECHECK_COMPLETE").get_completions(words.split(), begun)
+    plain = [item.value for item in items if item.type == "plain"]
+    for name in completed:
+        assert any(value.startswith(name) for value in plain), plain
+    assert all(any(value.startswith(name) for name in completed) for value in plain), plain
+    # a file may stand where a shipped one is named; a shell looks for those itself, and is told so first
+    files = [place for place, item in enumerate(items) if item.type == "file"]
+    assert files == ([0] if words.split()[-1] in ("--printer", "--config", "--ranges", "materials") else [])
 
 
 def test_wrong_usage_names_the_help_of_its_own_command(capsys):

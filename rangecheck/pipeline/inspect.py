@@ -182,6 +182,14 @@ def materials(names: Sequence[str], out: str | None, *, force: bool, reporter: R
     return Outcome(document("materials", materials=found), lines)
 
 
+def study_parts(name: str) -> tuple[str, ...]:
+    """The names of a study's parts; none of one that is made as a whole, or that does not exist."""
+    from rangecheck.studies import STUDIES
+
+    where = {**STUDIES, "job": "rangecheck.pipeline.job_study"}.get(name)
+    return () if where is None else tuple(getattr(import_module(where), "PARTS", ()))
+
+
 def study(name: str, out: str, *, quick: bool, force: bool, reporter: Reporter, part: str | None = None) -> Outcome:
     """A study of speed against accuracy and of stability, made again on this machine; charts and numbers in `out`."""
     from rangecheck.studies import study_named
