@@ -47,3 +47,7 @@ def require_text(path, content):
     """The same of a file's bytes, where they are JSON."""
     if Path(path).suffix == ".json":
         require(json.loads(content))
+    elif Path(path).suffix == ".jsonl":
+        for row in map(json.loads, content.splitlines()):
+            wrong = complaint(row, "dataset-row")
+            assert wrong is None, wrong

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import schemas_kept
 from rangecheck_cli.main import exit_status
 
 from rangecheck.dataset import check_picture, read_index, read_ranges, runs_of
@@ -18,6 +19,7 @@ from rangecheck.errors import SettingError
 from rangecheck.export.pictures import read_png
 from rangecheck.files import presets_folder
 from rangecheck.modeler import read_model
+from rangecheck.pipeline.documents import schemas
 
 WORKSHOP = presets_folder() / "scenes" / "workshop.toml"
 SMALL = ["--count", "8", "--size", "48x40", "--seed", "5", "-q"]
@@ -51,6 +53,15 @@ def test_every_truth_map_agrees_with_its_picture(made):
     dimmed = read_png(made / rows[0]["picture"]).copy()
     dimmed[20:24, 20:24] = 255 - dimmed[20:24, 20:24]
     assert any("noise" in said for said in check_picture(rows[0], dimmed, (made / rows[0]["truth"]).read_bytes(), surface))
+
+
+def test_what_a_data_set_says_of_itself_keeps_its_schemas(made):
+    for name in ("index.jsonl", "masks.json", "dataset.json"):
+        schemas_kept.require_text(made / name, (made / name).read_bytes())
+    row = read_index(made / "index.jsonl")[0]
+    assert "colour" in schemas_kept.complaint(row | {"colour": "red"}, "dataset-row")
+    assert "roll_deg" in schemas_kept.complaint(row | {"parameters": {**row["parameters"], "roll_deg": "level"}}, "dataset-row")
+    assert json.loads((made / "dataset.json").read_text())["rows"] == schemas()["dataset-row"]["title"]
 
 
 def test_masks_are_coco_and_every_pixel_has_one(made):

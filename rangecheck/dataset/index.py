@@ -13,7 +13,7 @@ from rangecheck.arrays import BoolArray
 from rangecheck.errors import InputError
 from rangecheck.files import read_bytes
 
-SCHEMA = "rangecheck/dataset/1"
+SCHEMA, ROW_SCHEMA = "rangecheck/dataset/1", "rangecheck/dataset-row/1"
 
 
 def runs_of(mask: BoolArray) -> list[int]:

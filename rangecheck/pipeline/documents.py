@@ -30,6 +30,7 @@ from rangecheck.pipeline.json_shapes import (
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 CONFIGURATION = "configuration"
+OF_LINES = ("dataset-row",)
 POINT, POSE = many(NUMBER, 3), many(many(NUMBER, 4), 4)
 SEVERITY = one_of("note", "warning", "error")
 NUMBERS, TEXTS, NAMES = by_name(NUMBER), many(TEXT), by_name(TEXT)
@@ -63,10 +64,12 @@ def _whole(name: str, about: str, *forms: Shape) -> Shape:
 
 
 def _tagged(form: Shape, name: str) -> Shape:
-    """The form, saying its schema: at its top, or in its `info` where it is an annotation file."""
+    """The form, saying its schema: at its top, or in its `info` where it is an annotation file; lines of a file leave it to another."""
     tag = {"const": f"rangecheck/{name}/1"}
     if "info" in form["properties"]:
         return form | {"properties": form["properties"] | {"info": record(schema=tag)}}
+    if name in OF_LINES:
+        return form
     return form | {"properties": {"schema": tag} | form["properties"], "required": ["schema", *form["required"]]}
 
 
@@ -265,8 +268,12 @@ def _documents() -> dict[str, tuple[Any, ...]]:
         "dataset": (
             "`dataset`, its dataset.json, and its masks.json, a COCO annotation file",
             record(output=TEXT, pictures=COUNT, size=many(COUNT, 2), ranges=by_name(ANYTHING), wrong=TEXTS, seconds=NUMBERS),
-            with_others(record(pictures=COUNT, part_names=TEXTS, length_unit=one_of("mm"), seed=COUNT)),
+            with_others(record(pictures=COUNT, part_names=TEXTS, length_unit=one_of("mm"), seed=COUNT, rows=one_of("rangecheck/dataset-row/1"))),
             record(info=ANYTHING, images=many(by_name(ANYTHING)), annotations=many(by_name(ANYTHING)), categories=many(by_name(ANYTHING))),
+        ),
+        "dataset-row": (
+            "A line of a data set's index.jsonl: a picture, its truth, and all that they were made with; dataset.json names this schema for all",
+            _row_of_a_dataset(shown),
         ),
         "fit": (
             "`fit` of a material to photographs",
@@ -322,6 +329,17 @@ def _documents() -> dict[str, tuple[Any, ...]]:
         ),
         "unfinished": ("The mark of a job that was not finished, with the key of what it was asked", record(key=TEXT)),
     }  # fmt: skip
+
+
+def _row_of_a_dataset(shown: dict[str, Shape]) -> Shape:
+    from rangecheck.dataset.ranges import Sample
+
+    return record(
+        index=COUNT, picture=TEXT, truth=TEXT, picture_sha256=TEXT, truth_sha256=TEXT, width=COUNT, height=COUNT, **shown, exposure=NUMBER,
+        sensor=record(full_well=NUMBER, read_noise=NUMBER, bits=COUNT, response=one_of("linear")),
+        sources=many(record(centre_mm=POINT, radius_mm=NUMBER, radiance=many(NUMBER))), parameters=fields_of(Sample), seed=COUNT,
+        regions=many(record(part=COUNT, name=TEXT, area=COUNT, bbox=many(COUNT, 4), runs=many(COUNT))), wrong=TEXTS,
+    )  # fmt: skip
 
 
 def _settings() -> Shape:

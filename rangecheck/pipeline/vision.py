@@ -16,7 +16,17 @@ import numpy as np
 from rangecheck import __version__, kernels
 from rangecheck.animation.frames import key_of
 from rangecheck.config import Settings
-from rangecheck.dataset import SCHEMA, Made, Ranges, check_picture, make_picture, masks_document, read_index, read_ranges
+from rangecheck.dataset import (
+    ROW_SCHEMA,
+    SCHEMA,
+    Made,
+    Ranges,
+    check_picture,
+    make_picture,
+    masks_document,
+    read_index,
+    read_ranges,
+)
 from rangecheck.errors import SettingError
 from rangecheck.export.camera_files import write_colmap
 from rangecheck.export.pictures import read_png
@@ -183,6 +193,7 @@ def _write_index(folder: Path, rows: list[dict[str, Any]], scene: Scene, ranges:
             "part_names": list(names),
             "length_unit": "mm",
             "seed": seed,
+            "rows": ROW_SCHEMA,
             **ranges.to_dict(),
         },
     )
