@@ -1,6 +1,7 @@
 """Mesh files of every kind come to the same surface, and what is wrong with a file is said in one line."""
 
 import struct
+import sys
 import tracemalloc
 import zipfile
 
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 from test_topology_distance import CUBE_CORNERS, CUBE_FACES, cube
 
-from rangecheck.errors import InputError, UnitMissing
+from rangecheck.errors import DependencyMissing, InputError, UnitMissing
 from rangecheck.export.meshes import write_mesh
 from rangecheck.surface import Surface
 from rangecheck.surface import topology as topo
@@ -119,6 +120,14 @@ def test_glb_is_in_metres_and_3mf_says_its_unit(tmp_path, kind, volume_mm3):
     trimesh.Trimesh(cube().vertices, cube().faces, process=False).export(tmp_path / f"c.{kind}")
     read = open_mesh(tmp_path / f"c.{kind}")
     assert read.surface.volume_mm3 == pytest.approx(volume_mm3, rel=1e-6) and topo.is_closed(read.surface)
+
+
+@pytest.mark.parametrize("lacking", ["networkx", "lxml"])
+def test_what_reading_3mf_lacks_is_named(tmp_path, monkeypatch, lacking):
+    path = three_mf(tmp_path / "one.3mf", TETRAHEDRON, '<item objectid="1"/>')
+    monkeypatch.setitem(sys.modules, lacking, None)
+    with pytest.raises(DependencyMissing, match=rf"^{lacking} is needed for reading 3MF .*rangecheck\[formats\]"):
+        read_mesh(path)
 
 
 def test_what_is_odd_is_said(tmp_path):

@@ -7,6 +7,7 @@ nothing is merged by nearness, dropped or turned. The labels of rangecheck's own
 
 from __future__ import annotations
 
+import importlib
 import io
 import re
 import zipfile
@@ -283,8 +284,13 @@ def _through_trimesh(path: Path, content: bytes, kind: str) -> tuple[FloatArray,
     """Vertices, faces and unit of GLB or 3MF, all instances placed by their transforms."""
     try:
         import trimesh
-    except ImportError:
-        raise DependencyMissing("trimesh", f"reading {kind.upper()}", "pip install trimesh") from None
+
+        for package in ("networkx", "lxml") if kind == "3mf" else ():  # trimesh says without their names that it lacks them
+            importlib.import_module(package)
+    except ImportError as error:
+        lacking = error.name or "trimesh"
+        remedy = "pip install trimesh" if lacking == "trimesh" else "pip install 'rangecheck[formats]'"
+        raise DependencyMissing(lacking, f"reading {kind.upper()}", remedy) from None
     if kind == "3mf":
         _refuse_to_swell(path, content)
         _refuse_to_multiply(path, content)
