@@ -50,7 +50,12 @@ from .common import Point, common, settings_from
 @click.option("--same-strength", is_flag=True, help="With --calibrate matt: the lamps are known to be of one strength.")
 @click.option("--spike", is_flag=True, help="Also fit a mirror's share; its highlight must be seen.")
 @click.option(
-    "-o", "--output", "out", type=click.Path(), metavar="FILE", help="Material file (.toml); with --calibrate the list of lights."
+    "-o",
+    "--output",
+    "out",
+    type=click.Path(),
+    metavar="FILE",
+    help="Material file (.toml); with --calibrate the list of lights; of a scan, a picture (.png) of what its brightness contradicts.",
 )
 @common("unit", "config", "set", "force")
 def command(

@@ -7,6 +7,7 @@ from test_cli import complaint
 from rangecheck.export.meshes import write_mesh
 from rangecheck.modeler.primitives import sphere
 from rangecheck.surface import Surface
+from rangecheck.surface.mesh_files import read_mesh
 
 
 @pytest.fixture(scope="module")
@@ -43,6 +44,7 @@ WRONG = [
     ("fit picture.png -o f.toml --sphere 9,9,50 --on ball.ply", ("one of --sphere COLUMN,ROW,RADIUS and --on MESH",)),
     ("fit picture.png -o f.toml --sphere 9,9,500 --calibrate chrome", ("radius 500", "16x12; give its outline")),
     ("fit text.png -o f.toml --sphere 9,9,5 --calibrate chrome", ("text.png: is no picture that can be read; JPEG, PNG",)),
+    ("fit empty -o f.toml", ("f.toml: must end in .png",)),
     ("simulate ball.ply --unit mm -o s --finder lost_shares=1", ("no 'lost_shares'; did you mean lost_share?",)),
     ("simulate ball.ply --unit mm -o s --finder lost_share", ("--finder takes key=value; got 'lost_share'",)),
     ("simulate ball.ply --unit mm -o s --drift 1,2", ("'1,2' is not a velocity; write X,Y,Z in mm/s",)),
@@ -75,10 +77,19 @@ def test_a_wrong_wish_is_answered_with_the_rule_the_value_and_the_next_step(aske
     assert " 0x" not in told and "Error" not in told
 
 
-def test_a_surface_that_is_open_is_no_stl_and_is_told_what_makes_one(sample_data, tmp_path, capsys):
-    told = complaint(capsys, "mesh", sample_data / "frontal", "-o", tmp_path / "face.stl", "-q")
+def test_a_surface_that_is_open_is_no_stl_and_is_told_what_makes_one(folder, sample_data, tmp_path, capsys, monkeypatch):
+    half = read_mesh(folder / "ball.ply").vertices
+    np.savetxt(tmp_path / "half.xyz", half[half[:, 2] > 0.0])
+    told = complaint(
+        capsys, "mesh", tmp_path / "half.xyz", "--unit", "mm", "--method", "pivot", "-o", tmp_path / "half.stl", "-q"
+    )
     assert "boundary edges; write a .ply" in told and "rangecheck solid" in told
-    assert list(tmp_path.iterdir()) == []
+    # a single scan's grid is open whatever it shows: nothing is computed first
+    monkeypatch.setattr("rangecheck.pipeline.scanning.prepared", lambda *_: pytest.fail("the scan was prepared"))
+    for more in ([], ["--method", "grid"]):
+        told = complaint(capsys, "mesh", sample_data / "frontal", "-o", tmp_path / "face.stl", "-q", *more)
+        assert "is open: nothing behind it was seen; write a .ply" in told and "rangecheck solid" in told
+    assert [path.name for path in tmp_path.iterdir()] == ["half.xyz"]
 
 
 def test_a_focal_point_on_the_surface_has_no_distances(folder, tmp_path, capsys):

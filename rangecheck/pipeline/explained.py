@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 
 from rangecheck import rigid
-from rangecheck.errors import ScanError
+from rangecheck.errors import OutputError, ScanError
 from rangecheck.export.legend import INK, PAPER, ColourScale, colours_of, font, framed, letter_px
 from rangecheck.export.pictures import Picture, write_png
 from rangecheck.optics import Sensor
 from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.subject import hashes, holds_capture, read_all_scans
+from rangecheck.pipeline.views import refuse_existing
 from rangecheck.progress import Reporter
 from rangecheck.recover.compare import JUDGED_MM, Comparison, compare
 from rangecheck.recover.dents import JUDGED_MM as DENT_MM
@@ -146,7 +147,12 @@ def fit_scan(
     path: str, out: str | None, *, response: str, unit: str | None, scale_mm: float | None, force: bool, reporter: Reporter
 ) -> Outcome:
     """Material and lamp of a scan's brightness image on the scan's own surface, and where the scan does not explain it."""
+    if out is not None and Path(out).suffix.lower() != ".png":
+        raise OutputError(out, "must end in .png: of a scan and its own brightness, the picture of what is left is written")
     scans = read_all_scans([path], unit, reporter)
+    pictures = {} if out is None else {s.name: Path(out) if len(scans) == 1 else _named(Path(out), s.name) for s in scans}
+    for picture in pictures.values():
+        refuse_existing(picture, force)
     results, lines = [], []
     fit = True
     for scan in scans:
@@ -157,11 +163,14 @@ def fit_scan(
         results.append({"name": scan.name} | facts(found))
         lines += told(scan.name, found)
         fit &= not any(region.kind in AGAINST_SHAPE for region in found.regions)
-        if out is not None:
-            name = Path(out) if len(scans) == 1 else Path(out).with_name(f"{Path(out).stem}-{scan.name}{Path(out).suffix}")
-            write_png(name, residual_picture(found, scan.name), force=force)
-            lines.append(f"{name}: {_MEANS}; beyond 1 a place is named")
+        if pictures:
+            write_png(pictures[scan.name], residual_picture(found, scan.name), force=force)
+            lines.append(f"{pictures[scan.name]}: {_MEANS}; beyond 1 a place is named")
     return Outcome(document("explained", fit=fit, scans=results, inputs=hashes([path]), seconds=reporter.seconds), lines, fit)
+
+
+def _named(picture: Path, scan: str) -> Path:
+    return picture.with_name(f"{picture.stem}-{scan}{picture.suffix}")
 
 
 def _step(scan: RangeScan, cells: int = _CELLS) -> int:

@@ -10,7 +10,7 @@ from rangecheck.errors import OutputError, PosesRefused
 from rangecheck.pipeline.folder import check_free, job_folder, key_of
 from rangecheck.pipeline.health import versions
 from rangecheck.pipeline.outcome import Outcome, document
-from rangecheck.pipeline.preparing import prepared
+from rangecheck.pipeline.preparing import Measured, prepared
 from rangecheck.pipeline.subject import hashes, read_all_scans, surface_of
 from rangecheck.pipeline.views import refuse_existing
 from rangecheck.progress import Reporter
@@ -26,6 +26,8 @@ def mesh(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None
         raise OutputError(out, f"ends in {Path(out).suffix or 'nothing'}; a mesh ends in {', '.join(SUFFIXES)}")
     refuse_existing(out, force)
     read = read_all_scans(scans, unit, reporter)
+    if Path(out).suffix.lower() == ".stl":
+        _require_more_than_a_grid(read, settings.meshing.method, out)
     try:
         ready = prepared(read, settings, reporter)
     except PosesRefused as refusal:
@@ -60,6 +62,17 @@ def mesh(scans: Sequence[str], out: str, *, settings: Settings, unit: str | None
         ),
         lines,
     )  # fmt: skip
+
+
+def _require_more_than_a_grid(scans: Sequence[Measured], method: str, out: str) -> None:
+    """Raises OutputError where scans will be meshed by grid: one view's cells are a sheet, which has a rim. Of other methods it shows later."""
+    from rangecheck.surface.meshing import choose_method
+
+    if "grid" in (method, choose_method(scans)[0] if method == "auto" else ""):
+        raise OutputError(
+            out, f"STL is for what can be built, and {'a grid' if method == 'grid' else 'the grid of a single scan'} is open: nothing behind it "
+            "was seen; write a .ply, and make a part of it with `rangecheck solid`",
+        )  # fmt: skip
 
 
 def refused(command: str, refusal: PosesRefused, reporter: Reporter) -> Outcome:
