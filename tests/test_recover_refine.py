@@ -7,12 +7,16 @@ import pytest
 from rangecheck_cli.main import exit_status
 
 from rangecheck.errors import ScanError
+from rangecheck.files import read_json
 from rangecheck.optics import PinholeCamera
+from rangecheck.pipeline.refining import share_refined
 from rangecheck.recover.balance import Balance
 from rangecheck.recover.grid import scan_grid
 from rangecheck.recover.heights import height_grid
 from rangecheck.recover.refine import refine, refined_faces
 from rangecheck.scan import RangeScan
+from rangecheck.surface import MEASURED
+from rangecheck.surface.mesh_files import read_mesh
 from rangecheck.surface.meshing import grid_mesh
 
 SIZE, RADIUS_MM, AWAY_MM, NOISE_MM = 110, 60.0, 400.0, 0.2
@@ -263,6 +267,7 @@ def test_faces_on_refined_cells_are_told_and_keep_their_origin(clean):
     labelled = replace(surface, refined_of_face=label)
     assert np.array_equal(labelled.with_faces(np.flatnonzero(label)).refined_of_face, np.ones(label.sum(), bool))
     assert np.array_equal(labelled.origin_of_face, surface.origin_of_face)
+    assert 0.5 < share_refined(labelled) < 1.0 and share_refined(surface) == 0.0
 
 
 def test_the_command_refines_only_when_asked(tmp_path, clean):
@@ -273,3 +278,20 @@ def test_the_command_refines_only_when_asked(tmp_path, clean):
         assert exit_status(["mesh", str(tmp_path / "in"), "--method", "grid", "-o", str(tmp_path / name), "-q", *more]) == 0
     assert b"property uchar refined" not in (tmp_path / "raw.ply").read_bytes()[:1000]
     assert b"property uchar refined" in (tmp_path / "fine.ply").read_bytes()[:1000]
+
+
+def test_a_job_says_in_its_surface_and_its_report_what_shading_refined(tmp_path, clean):
+    from rangecheck.pipeline.page import page_of
+    from rangecheck.report.page import _model_form
+    from rangecheck.scan.readers import write_scans
+
+    write_scans(tmp_path / "in", [clean[0]], step_mm=0.01)
+    small = ["--refine", "--size", "48x48", "--frames", "1", "--preset", "quick", "--set", "scan.quality=false", "-q"]
+    assert exit_status(["run", str(tmp_path / "in"), "--out", str(tmp_path / "out"), *small]) == 0
+    surface = read_mesh(tmp_path / "out" / "surface.ply")
+    assert 0.5 < share_refined(surface) < 1.0 and not surface.refined_of_face[surface.origin_of_face != MEASURED].any()
+    page = page_of(tmp_path / "out", read_json(tmp_path / "out" / "run.json"))
+    assert any(label == "Refined by shading" and "%, moved by 0." in said for label, said in page.scans[0].facts)
+    assert any("refined by shading; surface.ply says which" in line for line in page.decisions)
+    assert _model_form(page.model)["origins"][-1] == "measured, refined by shading"
+    assert abs(share_refined(page.model.surface) - share_refined(surface)) < 0.02

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from rangecheck_cli.main import exit_status
 from report_cases import job_of_a_vase, vase
+from test_topology_distance import CUBE_CORNERS, CUBE_FACES
 
+from rangecheck.config import load_settings
 from rangecheck.optics import PinholeCamera
 from rangecheck.pipeline import likeness as likenesses
 from rangecheck.pipeline.likeness import lighter, likeness
-from rangecheck.pipeline.page import page_of
+from rangecheck.pipeline.page import keep_for_report, page_of
 from rangecheck.report import Coverage, Figure, ReportContent, report_html
 from rangecheck.report.pack import octahedral, packed, packed_floats, unpacked
 from rangecheck.report.sphere import halves, seen_share
@@ -92,6 +94,24 @@ def test_deviation_is_what_the_scans_say_against_the_surface():
     )
     found = likeness(sheet, sheet, [scan], None)
     np.testing.assert_allclose(found.deviation_mm, 0.3, atol=1e-4)
+
+
+def test_directions_are_counted_from_the_middle_of_the_bust_not_of_the_relief_that_it_was_made_of(tmp_path):
+    """Readings of a relief may pass close to their own middle, from where they lie in few directions."""
+    camera = PinholeCamera.from_field_of_view(60, 60, 30.0)
+    _, directions = camera.rays(*np.meshgrid(np.arange(60.0), np.arange(60.0)))
+    scan = RangeScan(
+        200.0 / np.abs(directions[..., 2] / np.linalg.norm(directions, axis=-1)), camera, look_at((0, 0, 200.0), (0, 0, 0))
+    )
+    block = Surface(CUBE_CORNERS * (100.0, 100.0, 80.0) - (50.0, 50.0, 80.0), CUBE_FACES)
+    sheet = block.with_faces(np.flatnonzero((block.triangles[..., 2] == 0.0).all(axis=1)))
+    settings = load_settings("quick", (), {"picture.width": 32, "picture.height": 32})
+    keep_for_report(tmp_path, block, sheet, [scan], None, settings, front_deg=0.0)
+    with np.load(tmp_path / "likeness.npz") as kept:
+        counts = kept["coverage"]
+    rows, columns = counts.shape
+    ahead = np.r_[-columns // 9 : columns // 9]
+    assert (counts[rows // 3 : 2 * rows // 3, ahead] == 1).all()
 
 
 def test_one_scan_from_the_front_covers_the_front():

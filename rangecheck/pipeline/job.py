@@ -29,6 +29,7 @@ from rangecheck.pipeline.health import versions
 from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.page import contours_of, keep_for_report, page_of
 from rangecheck.pipeline.preparing import Prepared, prepared, scan_facts
+from rangecheck.pipeline.refining import labelled, share_refined
 from rangecheck.pipeline.scanning import refused
 from rangecheck.pipeline.shape import solid_of, standing_of
 from rangecheck.pipeline.subject import Subject, eye_of, hashes, read_all_scans, surface_of
@@ -83,6 +84,11 @@ def _made(
     made, judged = solid_of(surface, settings, reporter, eye_of(ready.scans))
     shown = surface if made is None else made.surface
     judged = _with_scan_findings(judged, shown, settings)
+    if ready.refined and settings.solid.height_mm is None:
+        shown = labelled(shown, ready.refined, ready.scans)
+        reporter.note(
+            f"{100 * share_refined(shown):.1f} % of the measured surface stands on heights refined by shading; surface.ply says which"
+        )
     write_mesh(shown, folder / "surface.ply")
 
     front = _front_deg(shown, eye_of(ready.scans), reporter)

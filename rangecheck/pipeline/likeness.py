@@ -6,7 +6,7 @@ World frame of the finished part, millimetres. Nothing here enters the STL.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from rangecheck.solid import Verdict
 from rangecheck.solid.engine import simplified
 from rangecheck.solid.findings import SEVERITIES
 from rangecheck.solid.thickness import Samples, wall_thickness_mm
-from rangecheck.surface import INVENTED, Surface
+from rangecheck.surface import INVENTED, MEASURED, Surface
 from rangecheck.surface.coarse import clustered
 from rangecheck.surface.distance import SurfaceDistance
 
@@ -63,6 +63,9 @@ def likeness(
             rank[one.faces] = np.maximum(rank[one.faces], 1 + SEVERITIES.index(one.severity))
         if rank.any():
             flagged = rank[real.distance_mm(light.vertices)[1]]
+    if shown.refined_of_face is not None:
+        face = real.distance_mm(light.triangles.mean(axis=1))[1]
+        light = replace(light, refined_of_face=shown.refined_of_face[face] & (light.origin_of_face == MEASURED))
     return Likeness(
         surface=light,
         off_mm=float(away.max()),

@@ -82,7 +82,8 @@ def keep_for_report(
         if scan.brightness is not None:
             grey = np.rint(255 * np.nan_to_num(np.clip(scan.brightness, 0, 1))).astype(np.uint8)
             write_bytes(folder / "brightness" / f"{scan.name}.png", png_bytes(grey))
-    made = likeness(shown, meshed, scans, found, same_place=settings.solid.height_mm is None)
+    same_place = settings.solid.height_mm is None
+    made = likeness(shown, meshed, scans, found, same_place=same_place)
     light = made.surface
     _write_arrays(
         folder / "likeness.npz",
@@ -91,13 +92,14 @@ def keep_for_report(
         part_of_face=light.part_of_face,
         origin_of_face=light.origin_of_face,
         part_names=np.array(light.part_names),
+        **({} if light.refined_of_face is None else {"refined_of_face": light.refined_of_face}),
         error_mm=made.error_mm.astype(np.float32),
         deviation_mm=made.deviation_mm.astype(np.float32),
         thickness_mm=made.thickness_mm.astype(np.float32),
         flagged=made.flagged,
         off_mm=np.array([made.off_mm, made.off_99_mm]),
         faces_before=np.array(made.faces),
-        coverage=counted([scan.points_mm() for scan in scans], meshed.bounds_mm.mean(axis=0)),
+        coverage=counted([scan.points_mm() for scan in scans], (shown if same_place else meshed).bounds_mm.mean(axis=0)),
     )
     shrink = min(1.0, RING_PX / max(settings.picture.width, settings.picture.height))
     size = {key: max(8, round(shrink * getattr(settings.picture, key))) for key in ("width", "height")}
@@ -167,7 +169,7 @@ def page_of(folder: Path, content: dict[str, Any], studies: Sequence[str | Path]
         fit=content["fit"],
         verdict="bust.stl can be built." if stl else "No STL was written: what stands against it is listed under Findings.",
         reasons=_reasons(content),
-        scans=[_scan(folder, facts, quality) for facts in content["scans"]],
+        scans=[_scan(folder, facts, content) for facts in content["scans"]],
         worth=_worth(quality),
         coverage=None if kept is None or not kept["coverage"].any() else _coverage(kept["coverage"], quality),
         model=None if kept is None else _model(kept),
@@ -226,7 +228,7 @@ _RINGS = (
 )
 _FILES = (
     ("bust.stl", "the solid, for the slicer"),
-    ("surface.ply", "the surface, each face labelled measured, interpolated or invented"),
+    ("surface.ply", "the surface, each face labelled measured, interpolated or invented, and whether shading refined it"),
     ("plaster.mp4", "turntable in plaster"),
     ("steel.mp4", "turntable in steel"),
     ("stripes.mp4", "turntable in mirrored stripes"),
@@ -263,8 +265,8 @@ def _length(value: float | None, digits: int) -> str:
     return "unknown" if value is None else f"{value:.{digits}f} mm"
 
 
-def _scan(folder: Path, facts: dict[str, Any], quality: dict[str, Any] | None) -> Scan:
-    name = facts["name"]
+def _scan(folder: Path, facts: dict[str, Any], content: dict[str, Any]) -> Scan:
+    name, quality = facts["name"], content.get("quality")
     if facts["camera"] is None:
         return Scan(name, [("Points", f"{facts['valid']:,}, a cloud without a grid")])
     rows = [
@@ -276,6 +278,11 @@ def _scan(folder: Path, facts: dict[str, Any], quality: dict[str, Any] | None) -
     rows.append(("Noise", _length(facts["noise_mm"] if view is None else view["noise_mm"], 3)))
     if view is not None:
         rows += [(label, f"{100 * view[key]:.0f} %") for label, key in _SHARES if view[key] is not None]
+    rows += [
+        ("Refined by shading", one.get("refused") or f"{100 * one['refined']:.0f} %, moved by {_length(one['moved_rms_mm'], 3)}")
+        for one in content.get("refined", ())
+        if one["name"] == name
+    ]
     pictures = [
         Figure(kind, "", read_bytes(path), alt=f"{kind} of {name}")
         for kind in ("Brightness", "Contours")
@@ -311,6 +318,7 @@ def _model(kept: dict[str, Any]) -> Model:
         kept["part_of_face"],
         kept["origin_of_face"],
         tuple(str(name) for name in kept["part_names"]),
+        refined_of_face=kept.get("refined_of_face"),
     )
     off, off_99 = kept["off_mm"]
     about = f"{len(surface.faces):,} faces"

@@ -11,7 +11,7 @@ from rangecheck.errors import ScanError
 from rangecheck.progress import Reporter
 from rangecheck.recover.refine import Refined, refine, refined_faces
 from rangecheck.scan import RangeScan
-from rangecheck.surface import Surface
+from rangecheck.surface import MEASURED, Surface
 
 
 @dataclass(frozen=True)
@@ -63,3 +63,11 @@ def labelled(surface: Surface, done: list[Refined], scans: list[Any]) -> Surface
     # a face's middle lies as far from its cells' ranges as noise and the slant of one cell let it
     reach = max(4.0 * float(np.nanmedian(one.noise_mm)) for one in placed) + 2.0 * float(np.sqrt(np.median(surface.face_areas)))
     return replace(surface, refined_of_face=refined_faces(surface, placed, reach))
+
+
+def share_refined(surface: Surface) -> float:
+    """Of the area measured, that whose heights a picture had a say in."""
+    if surface.refined_of_face is None:
+        return 0.0
+    area = surface.face_areas
+    return float(area[surface.refined_of_face].sum() / max(area[surface.origin_of_face == MEASURED].sum(), 1e-300))

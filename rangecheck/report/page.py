@@ -166,8 +166,12 @@ def _model_form(model: Model) -> dict[str, Any]:
     """The mesh with its vertices in the order of a curve through space, so that neighbours stand beside each other; vertices at which faces
     of different origin or part meet are taken once for each."""
     surface = model.surface
-    parts, origins = len(surface.part_names), len(ORIGIN_NAMES)
-    of_face = surface.part_of_face.astype(np.int64) * origins + surface.origin_of_face
+    names, origin_of_face = list(ORIGIN_NAMES), surface.origin_of_face
+    if surface.refined_of_face is not None:
+        names.append("measured, refined by shading")
+        origin_of_face = np.where(surface.refined_of_face, len(ORIGIN_NAMES), origin_of_face)
+    parts, origins = len(surface.part_names), len(names)
+    of_face = surface.part_of_face.astype(np.int64) * origins + origin_of_face
     # one number for vertex, part and origin: sorted many times as fast as rows of three
     keys, corners = np.unique(
         surface.faces.reshape(-1).astype(np.int64) * (parts * origins) + np.repeat(of_face, 3), return_inverse=True
@@ -192,7 +196,7 @@ def _model_form(model: Model) -> dict[str, Any]:
         "positions": packed(np.rint((surface.vertices[vertex] - low) / step).astype(np.uint16)),
         "normals": packed(octahedral(normals[order])),
         "faces": packed(faces),
-        "origins": list(ORIGIN_NAMES),
+        "origins": names,
         "origin": packed(origin),
         "flagged": None if model.flagged is None else packed(model.flagged[vertex].astype(np.uint8)),
         "fields": [

@@ -1,7 +1,7 @@
 /* The bust in three dimensions: coloured by what is known of it, cut by a plane, marked where findings are. */
 const SEVERITIES = ["none", "note", "warning", "error"];
 const SEVERITY_RGB = { none: [214, 208, 196], note: [90, 130, 190], warning: [226, 160, 40], error: [205, 50, 35] };
-const ORIGIN_RGB = [[128, 172, 134], [232, 190, 92], [196, 88, 72]];
+const ORIGIN_RGB = [[128, 172, 134], [232, 190, 92], [196, 88, 72], [84, 128, 186]];
 const PLAIN_RGB = [222, 217, 207], NONE_RGB = [150, 148, 143];
 const SPREAD = 2 * Math.tan((25 * Math.PI) / 360);
 
@@ -105,7 +105,7 @@ async function startViewer() {
     colours.needsUpdate = true;
     const field = model.fields[mode];
     if (field) drawScale(legend, field.colours, field.from, field.to, field.unit, field.about);
-    else if (mode === "origin") swatches(ORIGIN_RGB.map((c, k) => [c, data.model.origins[k]]));
+    else if (mode === "origin") swatches(data.model.origins.map((name, k) => [ORIGIN_RGB[k], name]));
     else if (mode === "findings") swatches(["error", "warning", "note"].filter((s) => data.findings.some((f) => f.severity === s)).map((s) => [SEVERITY_RGB[s], s]).concat(data.findings.length ? [] : [[SEVERITY_RGB.none, "no finding"]]));
     else legend.replaceChildren();
     markFindings();
