@@ -157,6 +157,13 @@ def test_the_page_can_be_made_again_from_the_folder_of_the_job(job, tmp_path, ca
     assert "holds no charts" in capsys.readouterr().err
 
 
+def test_shares_of_the_surface_say_of_which_surface(job):
+    """What is judged leaves base and back aside, which nobody measures; what is counted does not: the two are not to be mixed up."""
+    said = page_of(job, json.loads((job / "run.json").read_text())).reasons
+    assert any("of the surface, base and back left aside, was never measured; 0 % is allowed" in reason for reason in said)
+    assert any(reason.startswith("of the whole surface, with base and back, ") for reason in said)
+
+
 def test_the_likeness_on_disk_is_the_bust_of_the_job(job):
     with np.load(io.BytesIO((job / "likeness.npz").read_bytes()), allow_pickle=False) as kept:
         light = Surface(kept["vertices_mm"].astype(float), kept["faces"], origin_of_face=kept["origin_of_face"])

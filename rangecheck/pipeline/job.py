@@ -205,7 +205,8 @@ def _with_scan_findings(judged: Verdict, shown: Surface, settings: Settings) -> 
         faces = np.flatnonzero(invented)
         found.append(
             finding(
-                "too-much-invented", len(faces), f"{100 * share:.1f} % of the surface was never measured; {100 * limit:.0f} % is allowed",
+                "too-much-invented", len(faces),
+                f"{100 * share:.1f} % of the surface, base and back left aside, was never measured; {100 * limit:.0f} % is allowed",
                 shown.triangles[faces].mean(axis=1), faces, settings.checking.severities,
             )
         )  # fmt: skip

@@ -247,7 +247,10 @@ def _reasons(content: dict[str, Any]) -> list[str]:
     reasons = [f["message"] for f in found if f["severity"] == "error"]
     sentence = content["verdict"]["sentence"]
     reasons += [sentence] if not any(reason in sentence for reason in reasons) else []
-    reasons.append("of the surface, " + ", ".join(f"{100 * share:.1f} % is {name}" for name, share in shares.items()))
+    reasons.append(
+        "of the whole surface, with base and back, "
+        + ", ".join(f"{100 * share:.1f} % is {name}" for name, share in shares.items())
+    )
     if quality:
         reasons.append(
             f"the scans are {quality['verdict']} for {quality['profile']['name']}: expected error {_length(quality['expected_error_mm'], 3)}, "
