@@ -14,8 +14,16 @@ from .common import Point, common, settings_from
     help="They show a sphere of this outline, pixels, from far away.",
 )
 @click.option("--on", "model", type=click.Path(), metavar="MESH", help="They show this mesh, scan or modelled scene.")
+@click.option(
+    "--part",
+    metavar="NAME",
+    help="Of a scene: the body or face (body/face) whose material is looked for; the others' are known. The scene's file tells camera and "
+    "lamps, all in every picture, unless --camera and --lights do.",
+)
 @click.option("--camera", type=Point(), metavar="X,Y,Z", help="Where the camera stood, mm; it looks at the middle of the object.")
-@click.option("--field", type=click.FloatRange(1, 170), default=30.0, help="The camera's horizontal field of view, degrees.")
+@click.option(
+    "--field", type=click.FloatRange(1, 170), help="The camera's horizontal field of view, degrees; else the scene's own, or 30."
+)
 @click.option("--lights", type=click.Path(), metavar="FILE", help="About where the lamps stand: x y z, one line a picture.")
 @click.option("--calibrate", type=click.Choice(["chrome", "matt"]), help="Only find the lamps, on a sphere of this kind.")
 @click.option(
@@ -29,7 +37,10 @@ from .common import Point, common, settings_from
     help="Length over which a scan is held against its brightness.",
 )
 @click.option(
-    "--irradiance", type=click.FloatRange(1e-9), default=3.0, help="Of the lamps, so that a white surface shows irradiance/pi."
+    "--irradiance",
+    type=click.FloatRange(1e-9),
+    help="Of the lamps, so that a white surface shows irradiance/pi; 3 if not said. Of a scene's own lamps: of the first, or --set picture.exposure=E as "
+    "rendered.",
 )
 @click.option(
     "--find",
@@ -44,8 +55,7 @@ from .common import Point, common, settings_from
 @click.option(
     "--lamp-radius",
     type=click.FloatRange(0, 90, min_open=True, max_open=True),
-    default=0.25,
-    help="The lamps' angular radius, degrees.",
+    help="The lamps' angular radius, degrees; 0.25 if not said.",
 )
 @click.option("--same-strength", is_flag=True, help="With --calibrate matt: the lamps are known to be of one strength.")
 @click.option("--spike", is_flag=True, help="Also fit a mirror's share; its highlight must be seen.")
@@ -62,6 +72,7 @@ def command(
     pictures,
     sphere,
     model,
+    part,
     camera,
     field,
     lights,
@@ -90,7 +101,7 @@ def command(
     from rangecheck.pipeline import fit
 
     return fit(
-        pictures, out, settings=settings_from(config, assignments), unit=unit, sphere=sphere, model=model, camera_mm=camera,
+        pictures, out, settings=settings_from(config, assignments), unit=unit, sphere=sphere, model=model, part=part, camera_mm=camera,
         field_deg=field, lights=lights, calibrate=calibrate, response=response, noise=noise, spike=spike, irradiance=irradiance, scale_mm=scale,
         find=find, lamp_distance_mm=lamp_distance, lamp_radius_deg=lamp_radius, same_strength=same_strength, force=force, reporter=reporter,
     )  # fmt: skip

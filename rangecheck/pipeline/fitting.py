@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,9 @@ from rangecheck.arrays import FloatArray
 from rangecheck.errors import InputError, SettingError
 from rangecheck.files import read_bytes, write_bytes
 from rangecheck.optics import PinholeCamera, Sensor
+from rangecheck.pipeline.fitting_scene import faces_of, field_of, lamps_of, simulator
 from rangecheck.pipeline.outcome import Outcome, document
-from rangecheck.pipeline.subject import hashes, read_subject
+from rangecheck.pipeline.subject import Subject, hashes, read_subject
 from rangecheck.progress import Reporter
 from rangecheck.raycast import EmbreeCaster
 from rangecheck.recover.fit import Fitted
@@ -23,26 +25,31 @@ from rangecheck.recover.lights import ONE_NODE, SEVEN_NODES, Light
 from rangecheck.recover.looks import CameraFound, Look, facing, fit_looking, photographs
 from rangecheck.recover.problem import Guess, Problem, Unknowns
 from rangecheck.recover.sight import Sight, sphere_sight
+from rangecheck.recover.thrown import fit_simulated
 from rangecheck.reflectance import Material
 from rangecheck.scene import Scene
 
 _FAR = 1e4
 #: a distance that is looked for begins at this many sizes of the object
 _NEAR = 5.0
+#: of a camera and of lamps of which nothing is said
+_FIELD_DEG, _IRRADIANCE, _RADIUS_DEG = 30.0, 3.0, 0.25
 _UNITS = {"radius": " degrees", "distance": " mm", "sigma_um": " um", "correlation_um": " um"}
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm")
 
 
 def fit(
     pictures: Sequence[str], out: str | None, *, settings: Any, unit: str | None, sphere: tuple[float, float, float] | None, model: str | None,
-    camera_mm: tuple[float, ...] | None, field_deg: float, lights: str | None, calibrate: str | None, response: str, noise: float,
-    spike: bool, scale_mm: float | None, irradiance: float, force: bool, reporter: Reporter, find: Sequence[str] = (),
-    lamp_distance_mm: float | None = None, lamp_radius_deg: float = 0.25, same_strength: bool = False,
+    camera_mm: tuple[float, ...] | None, field_deg: float | None, lights: str | None, calibrate: str | None, response: str, noise: float,
+    spike: bool, scale_mm: float | None, irradiance: float | None, force: bool, reporter: Reporter, find: Sequence[str] = (),
+    lamp_distance_mm: float | None = None, lamp_radius_deg: float | None = None, same_strength: bool = False,
+    part: str | None = None,
 ) -> Outcome:  # fmt: skip
     """Material and lamps from `pictures`, one lamp each, of a `sphere` (column, row, radius: parallel view) or a `model` seen from
     `camera_mm`; or, with neither, of a scan's brightness on its own surface, and where the two contradict each other.
     `calibrate` (chrome or matt) finds the lamps of sphere pictures alone. `find`: what else is unknown, of pose, exposure, strength, distance, radius,
-    ambient; `lamp_distance_mm` and `lamp_radius_deg` are where the lamps' begin."""
+    ambient; `lamp_distance_mm` and `lamp_radius_deg` are where the lamps' begin.
+    Of a modelled scene `part` is looked for; its camera and lamps are known from its file where neither `camera_mm` nor `lights` says otherwise."""
     if sphere is None and model is None and len(pictures) == 1 and Path(pictures[0]).suffix.lower() not in _PICTURES:
         from rangecheck.pipeline.explained import fit_scan
 
@@ -66,29 +73,45 @@ def fit(
     if "pose" in find and sphere is not None:
         raise SettingError("a sphere's outline is its pose; --find pose is for --on MESH", key="find")
     look: Look | None = None
+    subject: Subject | None = None
+    if part is not None and sphere is not None:
+        raise SettingError("a sphere has no parts; --part is for --on SCENE", key="part")
     if sphere is not None:
         sight = facing(sphere_sight(sphere[:2], sphere[2], shape))
     else:
-        look = _look(str(model), values, noise, camera_mm, field_deg, settings, unit, reporter)
+        look, subject = _look(str(model), values, noise, camera_mm, field_deg, part, settings, unit, reporter)
         sight = look.see()
     middle, size = sight.points.mean(axis=0), max(float(np.ptp(sight.points, axis=0).max()), 1e-6)
     distance = lamp_distance_mm or size * (_NEAR if "distance" in find else _FAR)
-    begun = given if given is not None else _first_directions(sight, values)
-    lamps = tuple(Light(d, irradiance, middle, distance, lamp_radius_deg) for d in begun)
+    known = subject.model if subject is not None and subject.model is not None and subject.model.lamps and given is None else None
+    if known is not None and look is not None:
+        if lamp_distance_mm is not None or lamp_radius_deg is not None:
+            raise SettingError(f"{known.name} says where its lamps are; give --lights to place them otherwise", key="lights")
+        lamps = lamps_of(known, middle, settings.picture.exposure, irradiance)
+        look.together = True
+    else:
+        begun = given if given is not None else _first_directions(sight, values)
+        lamps = tuple(Light(d, irradiance or _IRRADIANCE, middle, distance, lamp_radius_deg or _RADIUS_DEG) for d in begun)
     names = (
         ("K_lm", "K_spike", "K_lobe", "sigma_um", "correlation_um") if spike else ("K_lm", "K_lobe", "sigma_um", "correlation_um")
     )
     free = {"strength": "irradiance"}
-    unknowns = Unknowns(names, one_camera=True, **{free.get(name, name): True for name in find})
+    unknowns = Unknowns(names, direction=known is None, one_camera=True, **{free.get(name, name): True for name in find})
     nodes = SEVEN_NODES if "radius" in find else ONE_NODE
-    taken = photographs(sight, values, lamps, noise, None if look is None else look.caster)
+    taken = photographs(sight, values, lamps, noise, None if look is None else look.caster, known is not None)
     problem = Problem(taken, lamps, Guess(), unknowns, nodes)
     from rangecheck.recover.fit import fit as solve
 
     with reporter.stage("fitting"):
         if look is None:
             return _told(solve(problem, known_noise=False), out, pictures, force, reporter, None)
-        fitted, found = fit_looking(problem, look)
+        if known is not None and subject is not None:
+            fitted, found, rests = fit_simulated(problem, look, simulator(subject, look, lamps, settings))
+            fitted = replace(fitted, converged=fitted.converged and rests)
+            if settings.light.model != "direct":
+                reporter.note("the error of the light that was simulated is not in the intervals (light.model)")
+        else:
+            fitted, found = fit_looking(problem, look)
     return _told(fitted, out, pictures, force, reporter, found)
 
 
@@ -146,7 +169,9 @@ def _within(fitted: Fitted, k: int) -> str:
     """How well a lamp's direction is known, in words: the larger half width of its two intervals."""
     pair = [e for e in fitted.estimates if e.name.startswith(f"light {k} direction")]
     widths = [0.5 * (e.high - e.low) for e in pair if e.low is not None and e.high is not None]
-    return f", within {math.degrees(max(widths)):.2g} degrees (95 %)" if pair and len(widths) == len(pair) else ", not determined"
+    if not pair:
+        return ", as the scene says"
+    return f", within {math.degrees(max(widths)):.2g} degrees (95 %)" if len(widths) == len(pair) else ", not determined"
 
 
 def _three(vector: FloatArray, digits: int = 4) -> str:
@@ -185,15 +210,25 @@ def _first_directions(sight: Sight, values: Sequence[FloatArray]) -> FloatArray:
 
 
 def _look(
-    model: str, values: Sequence[FloatArray], noise: float, camera_mm: tuple[float, ...] | None, field_deg: float, settings: Any, unit: str | None, reporter: Reporter
-) -> Look:  # fmt: skip
-    if camera_mm is None:
+    path: str, values: Sequence[FloatArray], noise: float, camera_mm: tuple[float, ...] | None, field_deg: float | None, part: str | None,
+    settings: Any, unit: str | None, reporter: Reporter,
+) -> tuple[Look, Subject]:  # fmt: skip
+    """What looks at the surface in `path`, and that."""
+    subject = read_subject(path, settings, unit, reporter)
+    surface, model = subject.surface, subject.model
+    if part is not None and model is None:
+        raise SettingError("only modelled scenes have parts; leave --part out", key="part")
+    if camera_mm is not None:
+        pose = np.array(rigid.look_at(camera_mm, surface.bounds_mm.mean(axis=0)))
+    elif model is not None and model.world_from_camera is not None:
+        pose, field_deg = np.array(model.world_from_camera), field_deg or field_of(model)
+    else:
         raise SettingError("say where the camera stood: --camera X,Y,Z in mm; it looks at the middle of the object", key="camera")
-    surface = read_subject(model, settings, unit, reporter).surface
-    scene = Scene(surface, (Material("grey", K_lm=0.5, wavelengths_um=(0.555,)),), smooth=True)
-    camera = PinholeCamera.from_field_of_view(values[0].shape[1], values[0].shape[0], field_deg)
-    pose = np.array(rigid.look_at(camera_mm, surface.bounds_mm.mean(axis=0)))
-    return Look(scene, EmbreeCaster(surface.vertices, surface.faces), camera, pose, values, noise)
+    normals = None if model is None else np.nan_to_num(model.corner_normals)
+    scene = Scene(surface, (Material("grey", K_lm=0.5, wavelengths_um=(0.555,)),), smooth=True, vertex_normals=normals)
+    camera = PinholeCamera.from_field_of_view(values[0].shape[1], values[0].shape[0], field_deg or _FIELD_DEG)
+    faces = None if model is None else faces_of(model, part)
+    return Look(scene, EmbreeCaster(surface.vertices, surface.faces), camera, pose, values, noise, faces), subject
 
 
 def _refuse_beside(sphere: tuple[float, float, float], width: int, height: int) -> None:

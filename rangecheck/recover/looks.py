@@ -16,7 +16,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rangecheck import rigid
-from rangecheck.arrays import FloatArray
+from rangecheck.arrays import BoolArray, FloatArray
+from rangecheck.errors import SceneError
 from rangecheck.optics import PinholeCamera
 from rangecheck.raycast import EmbreeCaster
 from rangecheck.recover.fit import explored, followed, settled
@@ -40,7 +41,8 @@ _SAME_SHADOWS = math.cos(math.radians(10.0))
 @dataclass
 class Look:
     """A camera that looks at a surface, from a pose that a fit may move by turns about the middle of the surface, and shifts; and the pictures (h, w) that
-    it took, linear, in parts of full scale, one lamp each, with their noise."""
+    it took, linear, in parts of full scale, one lamp each or all lamps `together`, with their noise. Where not all of the surface is of the material looked
+    for, `faces` (m,) are: the others only cast their shadows."""
 
     scene: Scene
     caster: EmbreeCaster
@@ -48,6 +50,8 @@ class Look:
     pose: FloatArray
     pictures: Sequence[FloatArray]
     noise: float
+    faces: BoolArray | None = None
+    together: bool = False
 
     @property
     def pivot_mm(self) -> FloatArray:
@@ -56,11 +60,12 @@ class Look:
 
     def see(self, step: int = 1) -> Sight:
         """The pixels that see the surface at angles that can be trusted, of every `step`-th row and column."""
-        return facing(see(self.scene, self.camera, self.pose, self.caster, step, self.pivot_mm))
+        seen = see(self.scene, self.camera, self.pose, self.caster, step, self.pivot_mm)
+        return facing(seen if self.faces is None else _inside(seen, self.faces, step))
 
     def at(self, problem: Problem, state: Problem, step: int = 1) -> Problem:
         """The problem at a state, seen from the present pose under that state's lamps."""
-        taken = photographs(self.see(step), self.pictures, state.lights, self.noise, self.caster)
+        taken = photographs(self.see(step), self.pictures, state.lights, self.noise, self.caster, self.together)
         photos = tuple(replace(t, exposure=p.exposure, ambient=p.ambient) for t, p in zip(taken, state.photographs))
         return replace(problem, photographs=photos, lights=state.lights, material=state.material)
 
@@ -87,15 +92,32 @@ def facing(sight: Sight) -> Sight:
     return sight.only((sight.normals * sight.views).sum(1) > _LEAST_COSINE)
 
 
+def _inside(sight: Sight, faces: BoolArray, step: int) -> Sight:
+    """The pixels of these faces but for the outermost, which may see what is beside them too. Raises SceneError where none is left."""
+    from scipy.ndimage import binary_erosion
+
+    mine = sight.spread(faces[sight.face].astype(float), 0.0) > 0.0
+    mine[::step, ::step] = binary_erosion(mine[::step, ::step], np.ones((3, 3)))
+    inside = sight.only(mine.reshape(-1)[sight.pixel])
+    if not len(inside):
+        raise SceneError("the camera sees nothing of the part that is looked for; name another, or check the camera")
+    return inside
+
+
 def photographs(
-    sight: Sight, pictures: Sequence[FloatArray], lamps: Sequence[Light], noise: float, caster: EmbreeCaster | None
-) -> tuple[Photograph, ...]:
-    """Pictures (h, w), linear in parts of full scale, one lamp each, as a fit takes them; without a caster nothing is in shadow."""
+    sight: Sight, pictures: Sequence[FloatArray], lamps: Sequence[Light], noise: float, caster: EmbreeCaster | None, together: bool = False
+) -> tuple[Photograph, ...]:  # fmt: skip
+    """Pictures (h, w), linear in parts of full scale, one lamp each or all lamps `together`, as a fit takes them; without a caster nothing is in shadow."""
     photos = []
     for k, picture in enumerate(pictures):
         seen = picture.reshape(-1)[sight.pixel]
-        lit = np.ones((len(sight), 1), bool) if caster is None else lit_by(sight, (lamps[k],), caster)
-        photos.append(Photograph(sight, seen, np.full(len(seen), noise), lit, (k,)))
+        shining = tuple(range(len(lamps))) if together else (k,)
+        lit = (
+            np.ones((len(sight), len(shining)), bool)
+            if caster is None
+            else lit_by(sight, tuple(lamps[n] for n in shining), caster)
+        )
+        photos.append(Photograph(sight, seen, np.full(len(seen), noise), lit, shining))
     return tuple(photos)
 
 
