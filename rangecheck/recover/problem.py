@@ -27,6 +27,8 @@ STRENGTHS = ("K_lm", "K_spike", "K_lobe")
 LENGTHS = ("sigma_um", "correlation_um")
 #: a lobe weaker than this is none
 LEAST_LOBE = 1e-4
+#: radius that a lamp may grow to: at 90 degrees it would stand all around
+WIDEST_DEG = 89.0
 _CHUNK = 8192
 #: owner of a parameter that serves all pictures
 _ALL = -1
@@ -164,9 +166,14 @@ class Problem:
                     Parameter(f"light {k} direction {axis}", "direction", k, n, 0.2, -1.5, 1.5) for n, axis in enumerate("ab")
                 ]
             later = k > 0 or not want.first_fixed
-            for kind, free in (("irradiance", want.irradiance and later), ("distance", want.distance), ("radius", want.radius)):
+            widest = max(math.log(WIDEST_DEG / self.lights[k].angular_radius_deg), 0.0)
+            for kind, free, most in (
+                ("irradiance", want.irradiance and later, 7.0),
+                ("distance", want.distance, 7.0),
+                ("radius", want.radius, widest),
+            ):
                 if free:
-                    found.append(Parameter(f"light {k} {kind}", kind, k, 0, 1.0, -7.0, 3.0 if kind == "radius" else 7.0))
+                    found.append(Parameter(f"light {k} {kind}", kind, k, 0, 1.0, -7.0, most))
         for k in range(len(self.photographs)):
             if want.exposure and (k > 0 or not want.first_fixed):
                 found.append(Parameter(f"picture {k} exposure", "exposure", k, 0, 1.0, -7.0, 7.0))
