@@ -262,7 +262,7 @@ def test_a_report_is_made_of_a_whole_job_only_and_of_its_own_folder(spoil, tmp_p
     }
     content = {
         "stl": None, "scans": [facts | {"spacing_mm": 1.0, "noise_mm": 1.0}], "fit": True, "verdict": {"findings": [], "sentence": "x"}, "area_shares": {},
-        "method": "fuse", "reason": "x", "turntables": [], "settings": {"turntable": {}}, "decisions": [], "versions": {}, "seconds": {}, "inputs": {},
+        "method": "fuse", "reason": "x", "turntables": [], "settings": {"turntable": {}, "solid": {}}, "decisions": [], "versions": {}, "seconds": {}, "inputs": {},
     }  # fmt: skip
     (tmp_path / "run.json").write_text(json.dumps(content))
     report(str(tmp_path), reporter=Reporter())
