@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 from rangecheck_cli.main import exit_status
 
+from rangecheck.config import load_settings
 from rangecheck.errors import ScanError
 from rangecheck.files import read_json
 from rangecheck.optics import PinholeCamera
+from rangecheck.pipeline.preparing import prepared
 from rangecheck.pipeline.refining import share_refined
+from rangecheck.progress import Reporter
 from rangecheck.recover.balance import Balance
 from rangecheck.recover.grid import scan_grid
 from rangecheck.recover.heights import height_grid
@@ -295,3 +298,14 @@ def test_a_job_says_in_its_surface_and_its_report_what_shading_refined(tmp_path,
     assert any("refined by shading; surface.ply says which" in line for line in page.decisions)
     assert _model_form(page.model)["origins"][-1] == "measured, refined by shading"
     assert abs(share_refined(page.model.surface) - share_refined(surface)) < 0.02
+
+
+def test_a_refined_scan_is_taken_to_err_by_no_less_than_its_readings(clean):
+
+    told = {}
+    for name in (False, True):
+        settings = load_settings(None, [f"scan.refine={str(name).lower()}"])
+        ready = prepared([clean[0]], settings, Reporter(), quality=True)
+        told[name] = ready.quality["views"][0]
+    assert told[True]["noise_mm"] < 0.7 * told[False]["noise_mm"]  # what neighbours show of it
+    assert told[True]["stated_noise_mm"] == pytest.approx(told[False]["noise_mm"], rel=0.15)
