@@ -166,7 +166,7 @@ class Problem:
                     Parameter(f"light {k} direction {axis}", "direction", k, n, 0.2, -1.5, 1.5) for n, axis in enumerate("ab")
                 ]
             later = k > 0 or not want.first_fixed
-            widest = max(math.log(WIDEST_DEG / self.lights[k].angular_radius_deg), 0.0)
+            widest = min(max(math.log(WIDEST_DEG / self.lights[k].angular_radius_deg), 0.0), 3.0)
             for kind, free, most in (
                 ("irradiance", want.irradiance and later, 7.0),
                 ("distance", want.distance, 7.0),
