@@ -82,9 +82,9 @@ def lit(scene: Scene, sample: Sample, material: Material) -> Scene:
         )
         for lamp in sample.lamps
     )
-    first = material
+    first = material.at(scene.materials[0].wavelengths_um)
     if not material.strengths()[1:].any():
-        first = replace(material, K_lm=sample.albedo)
+        first = replace(first, K_lm=sample.albedo)
     return replace(
         scene, materials=(first, *scene.materials[1:]), sources=sources, surroundings=gradient(sample.below, sample.above)
     )

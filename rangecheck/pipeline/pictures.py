@@ -18,7 +18,7 @@ from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.subject import Subject, read_subject
 from rangecheck.pipeline.views import refuse_existing, seen_by, view_of
 from rangecheck.progress import Reporter
-from rangecheck.reflectance import Material, load_material
+from rangecheck.reflectance import Material, load_material, side_by_side
 from rangecheck.scene import Scene, Source, gradient, studio
 from rangecheck.transport import Plan, Tracer, make_plan
 from rangecheck.transport import Settings as LightSettings
@@ -41,7 +41,7 @@ def scene_of(subject: Subject, material: Material, *, direct: bool = False, stri
         names = list(dict.fromkeys(name or material.name for name in model.material_of_part))
         return Scene(
             surface,
-            tuple(load_material(name) for name in names),
+            side_by_side([load_material(name) for name in names]),
             tuple(names.index(name or material.name) for name in model.material_of_part),
             tuple(Source(np.array(lamp.centre_mm), lamp.radius_mm, np.array([lamp.radiance])) for lamp in model.lamps),
             gradient(0.05, 0.25),

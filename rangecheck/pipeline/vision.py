@@ -37,7 +37,7 @@ from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.pictures import scene_of
 from rangecheck.pipeline.subject import read_subject
 from rangecheck.progress import Reporter
-from rangecheck.reflectance import Material, load_material
+from rangecheck.reflectance import Material, load_material, side_by_side
 from rangecheck.scene import Scene
 from rangecheck.transport import Tracer
 
@@ -92,7 +92,7 @@ def dataset(
     if not 1 <= count <= 10_000_000:
         raise SettingError(f"count is {count}; it must lie between 1 and 10000000", key="count")
     asked = read_ranges(ranges)
-    materials = {name: load_material(name) for name in asked.names}
+    materials = dict(zip(asked.names, side_by_side([load_material(name) for name in asked.names])))
     subject = read_subject(path, settings, unit, reporter)
     scene = replace(scene_of(subject, next(iter(materials.values()))), sources=())
     model = subject.model

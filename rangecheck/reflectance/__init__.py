@@ -9,7 +9,15 @@ from rangecheck.reflectance.brdf import (
     spike_reflectance,
 )
 from rangecheck.reflectance.charts import energy_table, polar_chart
-from rangecheck.reflectance.material import COLOUR_UM, GREY_UM, Material, load_material, material_names, stack_tables
+from rangecheck.reflectance.material import (
+    COLOUR_UM,
+    GREY_UM,
+    Material,
+    load_material,
+    material_names,
+    side_by_side,
+    stack_tables,
+)
 from rangecheck.reflectance.tables import MaterialTables
 
 __all__ = [
@@ -26,6 +34,7 @@ __all__ = [
     "material_names",
     "polar_chart",
     "sample_scattering",
+    "side_by_side",
     "spike_reflectance",
     "stack_tables",
 ]

@@ -174,6 +174,14 @@ class Material:
         return stack_tables([self])
 
 
+def side_by_side(materials: Sequence[Material]) -> tuple[Material, ...]:
+    """The same surfaces, all at the wavelengths of the one that is given at most (the first of those), so that one scene may hold them."""
+    if len({material.wavelengths_um for material in materials}) < 2:
+        return tuple(materials)
+    waves = max(materials, key=lambda material: len(material.wavelengths_um)).wavelengths_um
+    return tuple(material if material.wavelengths_um == waves else material.at(waves) for material in materials)
+
+
 def stack_tables(materials: Sequence[Material]) -> MaterialTables:
     """`materials` side by side, in order, for a tracer. Raises SceneError if their wavelengths differ or there is none.
 
