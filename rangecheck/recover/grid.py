@@ -147,5 +147,5 @@ def sight_of(grid: ScanGrid, cell: IntArray, normals: FloatArray) -> Sight:
     n = len(cell)
     return Sight(
         cell, np.zeros(n, np.int32), grid.points.reshape(-1, 3)[cell], normals, normals, -grid.rays.reshape(-1, 3)[cell], np.zeros(n),
-        np.full(n, grid.spacing_mm), np.zeros((n, 3, 3, 0)), (grid.valid.shape[0], grid.valid.shape[1]),
+        np.full(n, grid.spacing_mm), np.zeros((n, 3, 3, 0)), np.zeros((n, 0)), (grid.valid.shape[0], grid.valid.shape[1]),
     )  # fmt: skip

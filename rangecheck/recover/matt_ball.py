@@ -12,7 +12,19 @@ from collections.abc import Sequence
 import numpy as np
 
 from rangecheck.arrays import BoolArray, FloatArray, IntArray
-from rangecheck.recover.matt_light import GLOSS, SLOPE, STRENGTH, TURN, WIDTH, Surface, shown, turned
+from rangecheck.recover.matt_light import (
+    BODY_NUMBERS,
+    GLOSS,
+    LAMP_NUMBERS,
+    SLOPE,
+    STRENGTH,
+    TURN,
+    WIDTH,
+    Surface,
+    shown,
+    slopes,
+    turned,
+)
 from rangecheck.recover.sight import Sight
 
 #: pictures from which pixels have albedos, and lamps beams, of their own
@@ -25,8 +37,7 @@ LEAST_COSINE, _EDGE = 0.15, 0.0
 _SPREAD, _UNEVEN, _CLOSE, _LEAST_SPREAD = 0.1, 0.1, 0.05, 1e-3
 #: unevenness that beams may share
 _SHARED = 1e-4
-_ROUNDS, _STEPS, _SETTLED, _NUDGE, _LONGEST = 10, 6, 1e-5, 1e-4, 0.15
-_NUMBERS, _BODY = 6, 3
+_ROUNDS, _STEPS, _SETTLED, _LONGEST = 10, 6, 1e-5, 0.15
 #: ln of the gloss's width, and how far from it it may be expected;  the most of both slopes
 _WIDTH, _WIDTHS, _STEEPEST, _WIDEST = math.log(0.35), 0.5, 0.8, 0.7
 
@@ -55,7 +66,7 @@ class MattBall:
         self.beam_spread = np.array([_UNEVEN, _UNEVEN, _CLOSE])
         gains = np.maximum(np.linalg.norm(starts, axis=1), 1e-9)
         self.starts = starts / gains[:, None]
-        self.numbers = np.zeros((len(values), _NUMBERS))
+        self.numbers = np.zeros((len(values), LAMP_NUMBERS))
         self.numbers[:, STRENGTH] = np.log(gains).mean() if same_strength else np.log(gains)
         self.surface = np.array([0.2 if rough else 0.0, 0.02 if rough and several else 0.0, _WIDTH])
         self.least = _EDGE if several else LEAST_COSINE
@@ -73,14 +84,9 @@ class MattBall:
         """The ball's surface as found."""
         return Surface(float(self.surface[SLOPE]), float(self.surface[GLOSS]), math.exp(float(self.surface[WIDTH])))
 
-    def one(self, k: int, numbers: FloatArray, surface: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(matt at albedo 1, gloss) of picture k."""
-        body = Surface(float(surface[SLOPE]), float(surface[GLOSS]), math.exp(float(surface[WIDTH])))
-        return shown(self.sight.normals, self.sight.views, self.starts[k], numbers, body)
-
     def shown(self) -> tuple[FloatArray, FloatArray]:
         """(k, n) matt part at albedo 1, and gloss, at the present state."""
-        parts = [self.one(k, p, self.surface) for k, p in enumerate(self.numbers)]
+        parts = [shown(self.sight.normals, self.sight.views, d, p, self.body()) for d, p in zip(self.starts, self.numbers)]
         return np.array([p[0] for p in parts]), np.array([p[1] for p in parts])
 
     def weights(self, matt: FloatArray, gloss: FloatArray) -> FloatArray:
@@ -136,7 +142,7 @@ class MattBall:
     def _places(self) -> IntArray:
         """(k, 6) where each picture's numbers stand among all: one strength may serve every picture."""
         k = len(self.seen)
-        at = np.arange(_NUMBERS * k).reshape(k, _NUMBERS)
+        at = np.arange(LAMP_NUMBERS * k).reshape(k, LAMP_NUMBERS)
         if self.same:
             at[:, STRENGTH] = STRENGTH
         return at
@@ -147,17 +153,13 @@ class MattBall:
         matt, gloss = self.shown()
         paint = self.paint(matt, gloss, weight)
         off = paint * matt + gloss - self.seen
-        size = _NUMBERS * k + _BODY
+        size = LAMP_NUMBERS * k + BODY_NUMBERS
         matrix, right, joint = np.zeros((size, size)), np.zeros(size), np.zeros((n, size))
         places = self._places()
-        body = np.arange(_NUMBERS * k, size)
+        body = np.arange(LAMP_NUMBERS * k, size)
         for j in range(k):
-            by = np.empty((n, _NUMBERS + _BODY))
-            for c in range(_NUMBERS + _BODY):
-                numbers, surface = self.numbers[j].copy(), self.surface.copy()
-                (numbers if c < _NUMBERS else surface)[c if c < _NUMBERS else c - _NUMBERS] += _NUDGE
-                ahead, shine = self.one(j, numbers, surface)
-                by[:, c] = (paint * (ahead - matt[j]) + shine - gloss[j]) / _NUDGE
+            by_matt, by_gloss = slopes(self.sight.normals, self.sight.views, self.starts[j], self.numbers[j], self.body())
+            by = paint[:, None] * by_matt + by_gloss
             at = np.concatenate([places[j], body])
             weighed = by * weight[j][:, None]
             matrix[np.ix_(at, at)] += by.T @ weighed

@@ -288,50 +288,46 @@ class _Shown:
         self.numbers = photo.lights
         roughness, reach = two_numbers(guess.sigma_um, guess.correlation_um, guess.wavelength_um)
         self.strengths = np.array([guess.K_lm, guess.K_spike, guess.K_lobe])
-        points, normals, views = sight.points, sight.normals, sight.views
-        if pose.any():
-            moved = sight.by_pose @ pose
-            points, normals, views = points + moved[:, 0], normals + moved[:, 1], views + moved[:, 2]
-            normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-            views = views / np.linalg.norm(views, axis=1, keepdims=True)
+        seen = sight.moved(pose) if pose.any() else sight
         self.arguments = (
-            MASKINGS[guess.masking], self.strengths, roughness, reach, np.ascontiguousarray(points), np.ascontiguousarray(normals),
-            np.ascontiguousarray(views), sight.footprints, photo.lit.astype(np.uint8), *light_arrays(tuple(self.lights)),
+            MASKINGS[guess.masking], self.strengths, roughness, reach, np.ascontiguousarray(seen.points), np.ascontiguousarray(seen.normals),
+            np.ascontiguousarray(seen.views), seen.footprints, photo.lit.astype(np.uint8), *light_arrays(tuple(self.lights)),
             np.ascontiguousarray(state.nodes),
         )  # fmt: skip
         self.radiance = np.array([light.radiance for light in self.lights])
 
     def _shade(self, start: int, stop: int) -> tuple[FloatArray, ...]:
-        """value, by_material, by_centre, by_radius, by_point, by_normal, by_view of these pixels, source by source."""
+        """value, by_material, by_centre, by_radius, by_point, by_normal, by_view, by_footprint of these pixels, source by source."""
         m, s = stop - start, len(self.lights)
         one: tuple[FloatArray, ...] = np.empty((m, s)), np.empty((m, s, MATERIAL_NUMBERS))
-        out = (*one, np.empty((m, s, 3)), np.empty((m, s)), *(np.empty((m, s, 3)) for _ in range(3)))
+        out = (*one, np.empty((m, s, 3)), np.empty((m, s)), *(np.empty((m, s, 3)) for _ in range(3)), np.empty((m, s)))
         shade(*self.arguments, start, stop, *out)
         return out
 
     def fill_by_normal(self, start: int, stop: int, values: FloatArray, slopes: FloatArray) -> None:
-        value, *_, by_normal, _ = self._shade(start, stop)
+        value, *_, by_normal, _, _ = self._shade(start, stop)
         each = self.photo.exposure * self.radiance
         values[start:stop] = value @ each + self.photo.ambient
         slopes[start:stop] = np.einsum("msj,s->mj", by_normal, each)
 
-    def _by_pose(self, start: int, stop: int, by: Sequence[FloatArray]) -> FloatArray:
-        """(m, 6) by the pose's numbers, from those by point, normal and view, (m, 3) each."""
-        along = np.concatenate(by, axis=1)[:, None, :]
-        return np.asarray((along @ self.photo.sight.by_pose[start:stop].reshape(stop - start, -1, POSE_NUMBERS))[:, 0])
+    def _by_pose(self, start: int, stop: int, by: Sequence[FloatArray], by_footprint: FloatArray) -> FloatArray:
+        """(m, 6) by the pose's numbers, from those by point, normal and view, (m, 3) each, and by footprint (m,)."""
+        along, sight = np.concatenate(by, axis=1)[:, None, :], self.photo.sight
+        moved = (along @ sight.by_pose[start:stop].reshape(stop - start, -1, POSE_NUMBERS))[:, 0]
+        return np.asarray(moved + by_footprint[:, None] * sight.footprints_by_pose[start:stop])
 
     def fill(
         self, start: int, stop: int, values: FloatArray, jacobian: FloatArray, parameters: Sequence[Parameter],
         centre_slopes: Sequence[FloatArray], which: int,
     ) -> None:  # fmt: skip
-        value, by_material, by_centre, by_radius, *turned = self._shade(start, stop)
+        value, by_material, by_centre, by_radius, *turned, by_footprint = self._shade(start, stop)
         exposure, ambient = self.photo.exposure, self.photo.ambient
         each = exposure * self.radiance
         light = value @ each
         values[start:stop] = light + ambient
         rows = jacobian[start:stop]
         by_pose = (
-            self._by_pose(start, stop, [np.einsum("msj,s->mj", by, each) for by in turned])
+            self._by_pose(start, stop, [np.einsum("msj,s->mj", by, each) for by in turned], by_footprint @ each)
             if any(p.kind == "pose" for p in parameters)
             else None
         )

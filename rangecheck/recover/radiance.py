@@ -62,14 +62,15 @@ def masking_slopes(c, rms_slope):
 
 @kernel
 def disc_share(apart, source, pixel):
-    """(share, d/dapart, d/dsource) of a disc of radius `pixel` that a disc of radius `source` covers, their middles `apart`."""
+    """(share, d/dapart, d/dsource, d/dpixel) of a disc of radius `pixel` that a disc of radius `source` covers, their middles `apart`."""
     whole = math.pi * pixel * pixel
     if apart >= source + pixel:
-        return 0.0, 0.0, 0.0
+        return 0.0, 0.0, 0.0, 0.0
     if apart <= abs(source - pixel):
         if source >= pixel:
-            return 1.0, 0.0, 0.0
-        return (source / pixel) ** 2, 0.0, 2.0 * source / (pixel * pixel)
+            return 1.0, 0.0, 0.0, 0.0
+        share = (source / pixel) ** 2
+        return share, 0.0, 2.0 * source / (pixel * pixel), -2.0 * share / pixel
     p = max(-1.0, min(1.0, (apart * apart + source * source - pixel * pixel) / (2.0 * apart * source)))
     q = max(-1.0, min(1.0, (apart * apart + pixel * pixel - source * source) / (2.0 * apart * pixel)))
     chord = (
@@ -78,9 +79,9 @@ def disc_share(apart, source, pixel):
         )
         / apart
     )
-    arc = math.acos(p)
-    area = source * source * arc + pixel * pixel * math.acos(q) - 0.5 * apart * chord
-    return area / whole, -chord / whole, 2.0 * source * arc / whole
+    arc, own_arc = math.acos(p), math.acos(q)
+    share = (source * source * arc + pixel * pixel * own_arc - 0.5 * apart * chord) / whole
+    return share, -chord / whole, 2.0 * source * arc / whole, 2.0 * (pixel * own_arc / whole - share / pixel)
 
 
 @inline_kernel
@@ -158,7 +159,7 @@ def _lobe_node(
 @kernel
 def shade(
     masking, strengths, roughness, reach, points, normals, views, footprints, lit, centres, radii, frames, frame_slopes, nodes,
-    start, stop, value, by_material, by_centre, by_radius, by_point, by_normal, by_view,
+    start, stop, value, by_material, by_centre, by_radius, by_point, by_normal, by_view, by_footprint,
 ):  # fmt: skip
     """Radiance of pixels start..stop from each source at unit radiance, and its derivatives, into arrays of their own rows.
 
@@ -169,7 +170,7 @@ def shade(
     lit           (n, s) uint8, 0 where the source is hidden
     centres (s, 3), radii (s,);  frames (s, 2, 3): two unit vectors across the source;  frame_slopes (s, 2, 3, 3): their derivatives by
                   the centre;  nodes (q, 3): place in the unit disc and weight, weights adding to 1
-    value (n, s); by_material (n, s, 5); by_centre (n, s, 3); by_radius (n, s); by_point, by_normal, by_view (n, s, 3)
+    value (n, s); by_material (n, s, 5); by_centre (n, s, 3); by_radius (n, s); by_point, by_normal, by_view (n, s, 3); by_footprint (n, s)
     """
     rms_slope = math.sqrt(roughness / reach)
     k_lm, k_spike, k_lobe = strengths[0], strengths[1], strengths[2]
@@ -179,7 +180,7 @@ def shade(
         n, v, x = normals[row], views[row], points[row]
         c_r = v[0] * n[0] + v[1] * n[1] + v[2] * n[2]
         for s in range(len(radii)):
-            value[i, s] = by_radius[i, s] = 0.0
+            value[i, s] = by_radius[i, s] = by_footprint[i, s] = 0.0
             by_material[i, s, :] = 0.0
             by_centre[i, s, :] = 0.0
             by_point[i, s, :] = 0.0
@@ -213,7 +214,7 @@ def shade(
                 sine = math.sqrt(cx * cx + cy * cy + cz * cz)
                 apart = math.atan2(sine, cosine)
                 angle = math.asin(math.sqrt(sine2))
-                share, by_apart, by_angle = disc_share(apart, angle, footprints[row])
+                share, by_apart, by_angle, by_pixel = disc_share(apart, angle, footprints[row])
                 if share > 0.0:
                     left = math.exp(-4.0 * roughness * c_r * c_r)
                     value[i, s] += k_spike * left * share
@@ -232,6 +233,7 @@ def shade(
                     _add(by_normal, i, s, on_v * v[0] + on_w * wx, on_v * v[1] + on_w * wy, on_v * v[2] + on_w * wz)
                     _add(by_view, i, s, on_v * n[0] - turn * wx, on_v * n[1] - turn * wy, on_v * n[2] - turn * wz)
                     by_radius[i, s] += strength * by_angle / (d * math.cos(angle))
+                    by_footprint[i, s] = strength * by_pixel
 
             if roughness <= 0.0:
                 continue

@@ -54,11 +54,6 @@ def moved_sights(state: Problem, poses: FloatArray) -> Problem:
     photographs = []
     for photo, pose in zip(state.photographs, poses):
         if pose.any():
-            sight = photo.sight
-            moved = sight.by_pose @ pose
-            normals, views = sight.normals + moved[:, 1], sight.views + moved[:, 2]
-            normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-            views /= np.linalg.norm(views, axis=1, keepdims=True)
-            photo = replace(photo, sight=replace(sight, points=sight.points + moved[:, 0], normals=normals, views=views))
+            photo = replace(photo, sight=photo.sight.moved(pose))
         photographs.append(photo)
     return replace(state, photographs=tuple(photographs))

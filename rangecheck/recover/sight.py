@@ -8,7 +8,7 @@ derivatives are exact for what is drawn.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -22,6 +22,8 @@ from rangecheck.recover.lights import Light
 from rangecheck.scene import Scene
 
 POSE_NUMBERS = 6
+#: of what a pixel mirrors, sr, at least
+_LEAST_SOLID_ANGLE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +36,7 @@ class Sight:
     views       (n, 3) unit, to the camera
     footprints  (n,) angular radius, rad, of the disc as large as what the pixel mirrors; 0 where it is not known
     spans_mm    (n,) size of the pixel on the surface, across the view
-    by_pose     (n, 3, 3, 6): derivative of point, normal, view by the camera's turn and shift
+    by_pose     (n, 3, 3, 6): derivative of point, normal, view by the camera's turn and shift;  footprints_by_pose (n, 6)
     shape       (height, width) of the picture
     """
 
@@ -47,6 +49,7 @@ class Sight:
     footprints: FloatArray
     spans_mm: FloatArray
     by_pose: FloatArray
+    footprints_by_pose: FloatArray
     shape: tuple[int, int]
 
     def __len__(self) -> int:
@@ -56,6 +59,15 @@ class Sight:
         """The pixels chosen by index or mask."""
         chosen = {item.name: getattr(self, item.name)[keep] for item in fields(self) if item.name != "shape"}
         return Sight(**chosen, shape=self.shape)
+
+    def moved(self, pose: FloatArray) -> Sight:
+        """Seen from a camera moved by small turns and shifts (6,): to first order, normals and views kept at length 1."""
+        moved = self.by_pose @ pose
+        normals, views = self.normals + moved[:, 1], self.views + moved[:, 2]
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        views /= np.linalg.norm(views, axis=1, keepdims=True)
+        footprints = self.footprints + self.footprints_by_pose @ pose
+        return replace(self, points=self.points + moved[:, 0], normals=normals, views=views, footprints=footprints)
 
     def spread(self, values: FloatArray, fill: float = np.nan) -> FloatArray:
         """Values (n, ...) put back into a picture (h, w, ...), `fill` where nothing is seen."""
@@ -106,15 +118,16 @@ def see(
     normals[opposed] *= -1.0
     by_place[opposed] *= -1.0
     h, w = len(rows), len(columns)
-    spans, footprints = _footprints(points, normals, rays[seen], hit, seen, (h, w))
     pixel = (rows[seen // w] * camera.width + columns[seen % w]).astype(np.int64)
     by_pose = _by_pose(points, facing, by_place, origins[seen], rays[seen], pose[:3, 3])
     if pivot_mm is not None:
         # a turn about the pivot is one about the camera's middle, and the shift that takes the middle around
         by_pose[..., :3] += by_pose[..., 3:] @ np.cross(np.eye(3), pose[:3, 3] - pivot_mm).T
+    spans, footprints, footprints_by_pose = _footprints(points, normals, rays[seen], by_pose, seen, (h, w))
     return Sight(
-        pixel, hit, points, normals, facing, -rays[seen], footprints / step, spans / step, by_pose, (camera.height, camera.width)
-    )
+        pixel, hit, points, normals, facing, -rays[seen], footprints / step, spans / step, by_pose, footprints_by_pose / step,
+        (camera.height, camera.width),
+    )  # fmt: skip
 
 
 def _cast(caster: EmbreeCaster, origins: FloatArray, rays: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -131,20 +144,36 @@ def _cast(caster: EmbreeCaster, origins: FloatArray, rays: FloatArray) -> tuple[
 
 
 def _footprints(
-    points: FloatArray, normals: FloatArray, rays: FloatArray, face: IntArray, seen: IntArray, shape: tuple[int, int]
-) -> tuple[FloatArray, FloatArray]:
-    """Sizes of the pixels across the view, mm, and angular radii of the discs that they mirror, from their neighbours."""
-    mirrored = rays - 2.0 * (rays * normals).sum(1)[:, None] * normals
-    flat = np.full((shape[0] * shape[1], 6), np.nan)
-    flat[seen, :3], flat[seen, 3:] = points, mirrored
-    grid = flat.reshape(*shape, 6)
+    points: FloatArray, normals: FloatArray, rays: FloatArray, by_pose: FloatArray, seen: IntArray, shape: tuple[int, int]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Sizes of the pixels across the view, mm, angular radii of the discs that they mirror, from their neighbours, and the radii's derivatives (n, 6)."""
+    h, w = shape
+
+    def neighbours(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """How (n, c) values differ to the right and down, (n, c) each."""
+        flat = np.full((h * w, values.shape[1]), np.nan)
+        flat[seen] = values
+        grid = flat.reshape(h, w, -1)
+        return _differences(grid, 1).reshape(h * w, -1)[seen], _differences(grid, 0).reshape(h * w, -1)[seen]
+
+    cosine = (rays * normals).sum(1)[:, None]
     with np.errstate(invalid="ignore"):
-        right, down = _differences(grid, 1).reshape(-1, 6)[seen], _differences(grid, 0).reshape(-1, 6)[seen]
-    across = [d[:, :3] - (d[:, :3] * rays).sum(1)[:, None] * rays for d in (right, down)]
-    spans = np.sqrt(np.linalg.norm(np.cross(*across), axis=1))
-    solid_angle = np.linalg.norm(np.cross(right[:, 3:], down[:, 3:]), axis=1)
-    # facets of one normal mirror parallel rays in parallel: there the footprint is next to nothing, but not nothing
-    return np.nan_to_num(spans), np.nan_to_num(np.sqrt(np.maximum(solid_angle, 1e-12) / np.pi))
+        across = [d - (d * rays).sum(1)[:, None] * rays for d in neighbours(points)]
+        spans = np.sqrt(np.linalg.norm(np.cross(*across), axis=1))
+        right, down = neighbours(rays - 2.0 * cosine * normals)
+        area = np.cross(right, down)
+        solid_angle = np.linalg.norm(area, axis=1)
+        # facets of one normal mirror parallel rays in parallel: there the footprint is next to nothing, but not nothing
+        footprints = np.nan_to_num(np.sqrt(np.maximum(solid_angle, _LEAST_SOLID_ANGLE) / np.pi))
+        slopes = np.zeros((len(seen), POSE_NUMBERS))
+        for k in range(POSE_NUMBERS):
+            by_normal, by_ray = by_pose[:, 1, :, k], -by_pose[:, 2, :, k]
+            by_cosine = (by_ray * normals).sum(1)[:, None] + (rays * by_normal).sum(1)[:, None]
+            right_by, down_by = neighbours(by_ray - 2.0 * (by_cosine * normals + cosine * by_normal))
+            area_by = np.cross(right_by, down) + np.cross(right, down_by)
+            slopes[:, k] = (area * area_by).sum(1) / (2.0 * np.pi * solid_angle * footprints)
+    slopes[~(solid_angle > _LEAST_SOLID_ANGLE)] = 0.0
+    return np.nan_to_num(spans), footprints, slopes
 
 
 def _differences(grid: FloatArray, axis: int) -> FloatArray:
@@ -225,4 +254,7 @@ def sphere_sight(centre_px: tuple[float, float], radius_px: float, shape: tuple[
     by_place = np.broadcast_to(np.eye(3) / radius_px, (n, 3, 3)) - normals[:, :, None] * normals[:, None, :] / radius_px
     origins = points + 1000.0 * views
     by_pose = _by_pose(points, normals, by_place, origins, -views, np.array([0.0, 0.0, 1000.0]))
-    return Sight(pixel, np.zeros(n, np.int32), points, normals, normals.copy(), views, footprints, np.ones(n), by_pose, shape)
+    even = np.zeros((n, POSE_NUMBERS))
+    return Sight(
+        pixel, np.zeros(n, np.int32), points, normals, normals.copy(), views, footprints, np.ones(n), by_pose, even, shape
+    )
