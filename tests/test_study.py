@@ -192,6 +192,28 @@ def test_a_short_logarithmic_axis_reads_in_plain_numbers():
             assert expected <= shown and any("10^" in text for text in shown) is not bool(expected)
 
 
+def test_counts_have_ticks_at_whole_numbers_and_cases_their_names():
+    from matplotlib.figure import Figure
+
+    from rangecheck.study.drawing import _draw_lines
+
+    def ticks(chart):
+        axes = Figure().add_subplot()
+        _draw_lines(axes, chart)
+        axes.figure.canvas.draw()
+        low, high = axes.get_xlim()
+        labels = zip(axes.get_xticks(), axes.get_xticklabels())
+        return [label.get_text() for place, label in labels if low <= place <= high], axes.lines
+
+    counts, _ = ticks(LineChart("c", "C", "pictures", "y", [Line("one", [1, 2], [0.1, 0.05], True)], "xy", whole=True))
+    assert counts == ["1", "2"]
+    many, _ = ticks(LineChart("c", "C", "pictures", "y", [Line("one", list(range(40)), [1.0] * 40)], whole=True))
+    assert many and all(float(text) == int(text) for text in many)
+    cases, drawn = ticks(LineChart("c", "C", "case", "y", [Line("one", [0, 1], [0.1, 0.05])], names=["left", "right"]))
+    # no line joins what has no order
+    assert cases == ["left", "right"] and drawn[0].get_linestyle() == "None"
+
+
 def test_the_same_numbers_give_the_same_bytes():
     study = a_study()
     assert draw(study.charts[0], study.machine) == draw(study.charts[0], study.machine)

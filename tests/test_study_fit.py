@@ -3,7 +3,7 @@
 import numpy as np
 
 from rangecheck.recover.fit import fit
-from rangecheck.studies.fit import random_scene, truths
+from rangecheck.studies.fit_scenes import random_scene, truths
 
 
 def test_a_random_scene_is_its_seed_s_and_its_truth_fits_its_pictures():

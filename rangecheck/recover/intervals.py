@@ -14,7 +14,7 @@ import numpy as np
 
 from rangecheck.arrays import FloatArray, IntArray
 from rangecheck.recover.identify import VAGUE
-from rangecheck.recover.polish import TWO_SIDED_95, Estimate, Fitted, in_own_unit
+from rangecheck.recover.polish import HOLD, TWO_SIDED_95, Estimate, Fitted, in_own_unit
 from rangecheck.recover.problem import Problem
 from rangecheck.recover.starts import standing_for_all
 
@@ -57,7 +57,7 @@ class _Valley:
         self.parameters, self.theta = fitted.parameters, fitted.theta
         self.low, self.high = (np.array([getattr(p, side) for p in fitted.parameters]) for side in ("low", "high"))
         units = np.array([p.unit for p in fitted.parameters])
-        self.hold = 0.01 / units**2
+        self.hold = HOLD / units**2
         self.base, jacobian = self._shown(self.theta)
         self.information = jacobian.T @ jacobian + np.diag(self.hold)
 

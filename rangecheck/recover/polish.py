@@ -1,4 +1,8 @@
-"""Reweighted Gauss-Newton on all pixels (Huber 1964), and the statistics of where it ends."""
+"""Reweighted Gauss-Newton on all pixels (Huber 1964), and the statistics of where it ends.
+
+The scatter of the score is that of the residuals as they are, each over one minus its pixel's leverage (HC3 of MacKinnon & White 1985): where a few
+pixels hold a highlight the fit follows their noise, and their residuals are smaller than it.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +20,10 @@ from rangecheck.recover.residuals import BEND, OUTLIER, moved_sights, residuals
 #: standard deviations on either side of a 95 % interval
 TWO_SIDED_95 = 1.959963984540054
 _POLISH, _SETTLED, _LITTLE = 25, 0.03, 0.01
+#: what is known of a combination that nothing fixes: it lies within ten units
+HOLD = 0.01
+#: the least of one minus a pixel's leverage
+_LEAST_LEFT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +90,7 @@ def polish(problem: Problem, *, known_noise: bool = True, steps: int = _POLISH) 
         free = ~(((theta <= low) & (score > 0.0)) | ((theta >= high) & (score < 0.0)))
         step, spread = _step(normal, score, free, parameters, damping)
         moved = np.clip(theta + step, low, high)
-        trial = accumulate(problem, moved)
+        trial = accumulate(problem, moved, normal)
         evaluations += 1
         if trial[3] > cost * (1.0 + 1e-12) + 1e-9:
             damping = max(10.0 * damping, 1e-3)
@@ -97,6 +105,9 @@ def polish(problem: Problem, *, known_noise: bool = True, steps: int = _POLISH) 
         if small:
             converged = True
             break
+    if not taken:
+        normal, score, meat, cost, facts = accumulate(problem, theta, normal)
+        evaluations += 1
     scale, rms, outliers = facts
     free = ~(((theta <= low) & (score > 0.0)) | ((theta >= high) & (score < 0.0)))
     widen = 1.0 if known_noise else max(1.0, scale) ** 2
@@ -132,8 +143,8 @@ def _step(
     """Gauss-Newton step in the free parameters, kept within a unit each, and their standard deviations."""
     units = np.array([p.unit for p in parameters])
     scaled = (normal * units[:, None] * units[None, :])[np.ix_(free, free)]
-    # a prior of ten units keeps combinations that nothing fixes where they are
-    scaled = scaled + np.eye(len(scaled)) * 0.01 + np.diag(np.diag(scaled)) * damping
+    # keeps combinations that nothing fixes where they are
+    scaled = scaled + np.eye(len(scaled)) * HOLD + np.diag(np.diag(scaled)) * damping
     step, spread = np.zeros(len(units)), np.full(len(units), np.inf)
     solved = np.linalg.solve(scaled, -(score * units)[free])
     step[free] = solved / max(1.0, float(np.abs(solved).max(initial=0.0))) * units[free]
@@ -142,10 +153,13 @@ def _step(
 
 
 def accumulate(
-    problem: Problem, theta: FloatArray
+    problem: Problem, theta: FloatArray, information: FloatArray | None = None
 ) -> tuple[FloatArray, FloatArray, FloatArray, float, tuple[float, float, float]]:
-    """Information matrix, score, scatter of the score, cost, and (scale, rms, outliers) over all pictures at `theta`."""
+    """Information matrix, score, scatter of the score, cost, and (scale, rms, outliers) over all pictures at `theta`.
+
+    information: the matrix at or near `theta`, by which pixels have leverage; without it none has."""
     p = len(theta)
+    follow = None if information is None else _inverse(information, np.array([q.unit for q in problem.parameters()]))
     normal, meat, score = np.zeros((p, p)), np.zeros((p, p)), np.zeros(p)
     cost, outliers, count, squares = 0.0, 0, 0, 0.0
     sizes = []
@@ -156,7 +170,11 @@ def accumulate(
         psi = np.where(inside, np.clip(r, -BEND, BEND), 0.0)
         bent = jacobian * linear[:, None]
         normal += bent.T @ jacobian
-        weighed = jacobian * psi[:, None]
+        left = psi
+        if follow is not None:
+            leverage = np.where(linear, ((jacobian @ follow) * jacobian).sum(1), 0.0)
+            left = psi / np.maximum(1.0 - leverage, _LEAST_LEFT)
+        weighed = jacobian * left[:, None]
         meat += weighed.T @ weighed
         score += jacobian.T @ psi
         capped = np.minimum(size, OUTLIER)
@@ -168,6 +186,12 @@ def accumulate(
     scale = float(np.median(np.concatenate(sizes)) / 0.6744897501960817)
     rms = math.sqrt(squares / max(1, count - outliers))
     return normal, score, meat, cost, (scale, rms, outliers / max(1, count))
+
+
+def _inverse(information: FloatArray, units: FloatArray) -> FloatArray:
+    """(p, p) of the information beside what is known before."""
+    held = np.linalg.inv(information * units[:, None] * units[None, :] + np.eye(len(units)) * HOLD)
+    return np.asarray(held * units[:, None] * units[None, :])
 
 
 def in_own_unit(problem: Problem, p: Parameter, theta: float) -> float:

@@ -152,7 +152,11 @@ def classes(quick: bool) -> tuple[list[Any], list[str], list[dict[str, Any]]]:
         findings.append(f"{kind} planted alone in {scenes} scenes: named there {said}; {len(elsewhere)} places named elsewhere")
     right = [row[f"named {row['planted']}"] / scenes for row in rows]
     chart = LineChart(
-        "classes", "Named as what was planted", "number of the class: " + ", ".join(PLANTED), "share of the scenes",
-        [Line("right", list(range(len(rows))), right, True)], level=1.0,
+        "classes", f"One thing planted in a glossy ball's scan or picture: named as what it is ({scenes} scenes each)", "what was planted", "share of the scenes",
+        [
+            Line("named at all", list(range(len(rows))), [1.0 - row["named nothing"] / scenes for row in rows], True, dashed=True, colour=1),
+            Line("called what it is", list(range(len(rows))), right, True, colour=0),
+        ],
+        level=1.0, names=list(PLANTED), note="where nothing was planted nothing should be named, and that is what it is",
     )  # fmt: skip
     return [chart], findings, rows

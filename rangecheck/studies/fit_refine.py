@@ -154,7 +154,11 @@ def refinement(quick: bool) -> tuple[list[Any], list[str], list[dict[str, Any]]]
         )
     ]  # fmt: skip
     lines.append(Line("worst window of heights", cases_shown, [r["worst_window"] for r in kept], True))
-    chart = LineChart("refine", "Error after refinement over before, by case", "case", "ratio", lines, level=0.5)
+    chart = LineChart(
+        "refine", "Errors that refinement by shading leaves, views of the sample bust", "view, azimuth in degrees",
+        "rms error after refinement over before", lines, level=0.5, level_name="half", names=[f"{r['azimuth_deg']:g}, {r['spots'] or 'no'} spots of paint" for r in kept],
+        note="a window of heights above 1 got worse",
+    )  # fmt: skip
     return [chart], findings, rows
 
 

@@ -41,17 +41,22 @@ class EdgeChart:
 
 @dataclass(frozen=True)
 class Line:
-    """A named curve; `marked` points are drawn as dots."""
+    """A named curve; `marked` points are drawn as dots; lines that share a `colour` number belong together, one of them `dashed`."""
 
     label: str
     x: Sequence[float]
     y: Sequence[float]
     marked: bool = False
+    dashed: bool = False
+    colour: int | None = None
 
 
 @dataclass(frozen=True)
 class LineChart:
-    """Curves that belong to neither of the other two kinds. `level` draws a horizontal line at a value that matters."""
+    """Curves that belong to neither of the other two kinds. `level` draws a horizontal line at a value that matters, which `level_name` says.
+
+    names: of the cases that stand at x = 0, 1, 2 ..., drawn as points that no line joins;  whole: x counts things;  note: what the reader should know,
+    below the title."""
 
     slug: str
     title: str
@@ -60,6 +65,10 @@ class LineChart:
     lines: Sequence[Line]
     log: str = ""
     level: float | None = None
+    names: Sequence[str] = ()
+    whole: bool = False
+    note: str = ""
+    level_name: str = ""
 
 
 Chart = SpeedChart | EdgeChart | LineChart

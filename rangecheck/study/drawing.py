@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import math
+import textwrap
+from collections.abc import Sequence
 from typing import Any
 
 from rangecheck.study.charts import Chart, EdgeChart, LineChart, SpeedChart
@@ -13,6 +15,10 @@ from rangecheck.study.speed import pareto_front
 #: Okabe and Ito's eight colours, told apart by nearly everybody; black last
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C6D1F", "#000000")
 _MARKERS = "osD^vPX*"
+#: letters of a line of the title, and of the note below it
+_TITLE, _NOTE = 90, 118
+#: counts up to which each has its tick
+_FEW = 12
 #: logarithmic axes within these are numbered plainly
 _EVERYDAY = (1e-4, 1e5)
 
@@ -35,7 +41,11 @@ def draw(chart: Chart, machine: dict[str, Any], kind: str = "svg") -> bytes:
             _draw_edges(axes, chart)
         else:
             _draw_lines(axes, chart)
-        axes.set_title(chart.title, loc="left", fontsize=11)
+        note = "\n".join(textwrap.wrap(getattr(chart, "note", ""), _NOTE))
+        axes.set_title(textwrap.fill(chart.title, _TITLE), loc="left", fontsize=11, pad=6.0 + 12.0 * len(note.splitlines()))
+        axes.annotate(
+            note, (0.0, 1.0), xycoords="axes fraction", xytext=(0.0, 4.0), textcoords="offset points", fontsize=8.5, color="0.3"
+        )
         figure.supxlabel(machine_line(machine), fontsize=7, color="0.45", x=0.99, ha="right")
         with io.BytesIO() as stream:
             metadata = {"Date": None} if kind == "svg" else {"Software": None}
@@ -106,16 +116,37 @@ def _edge_label(edge: Any) -> str:
 
 def _draw_lines(axes: Any, chart: LineChart) -> None:
     for index, line in enumerate(chart.lines):
-        colour = _COLOURS[index % len(_COLOURS)]
+        number = (index if line.colour is None else line.colour) % len(_COLOURS)
         axes.plot(
-            line.x, line.y, color=colour, label=line.label, linewidth=1.5, marker="o" if line.marked else None, markersize=4
-        )
+            line.x, line.y, color=_COLOURS[number], label=line.label, linewidth=1.5, markersize=6 if chart.names else 4,
+            marker=_MARKERS[number] if chart.names else "o" if line.marked else None,
+            linestyle="none" if chart.names else "--" if line.dashed else "-",
+            markerfacecolor="white" if line.dashed else None,
+        )  # fmt: skip
     if chart.level is not None:
         axes.axhline(chart.level, color="#b03030", linewidth=1, linestyle="--")
+        axes.annotate(
+            chart.level_name, (1.0, chart.level), xycoords=("axes fraction", "data"), xytext=(0.0, 2.0), textcoords="offset points",
+            ha="right", color="#b03030", fontsize=8,
+        )  # fmt: skip
     _scales(axes, chart.log)
+    if chart.names:
+        axes.set_xticks(range(len(chart.names)), [textwrap.fill(name, 16) for name in chart.names], fontsize=8.5)
+        axes.set_xlim(-0.5, len(chart.names) - 0.5)
+    elif chart.whole:
+        _number_wholly(axes.xaxis, sorted({x for line in chart.lines for x in line.x}))
     axes.set_xlabel(chart.x_label)
     axes.set_ylabel(chart.y_label)
     axes.legend(loc="best", fontsize=8.5)
+
+
+def _number_wholly(axis: Any, values: Sequence[float]) -> None:
+    """Ticks at the counts themselves where they are few, at whole numbers anyway."""
+    from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
+
+    axis.set_major_locator(FixedLocator(values) if len(values) <= _FEW else MaxNLocator(integer=True))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
 def _scales(axes: Any, log: str) -> None:
