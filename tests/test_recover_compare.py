@@ -117,6 +117,45 @@ def test_what_is_wrong_alone_is_named_as_what_it_is_where_it_is(kind):
     assert named(kind, 3) == (kind, [])
 
 
+@pytest.mark.parametrize("kind, seed", [("shape", 702), ("registration", 1310), ("shadow edge", 1309), ("albedo", 1309)])
+def test_where_the_lamp_is_mirrored_a_fault_keeps_its_name(kind, seed):
+    from rangecheck.studies.fit_classes import named
+
+    assert named(kind, seed) == (kind, [])
+
+
+def test_where_it_is_too_dark_to_compare_a_dent_is_not_judged_rather_than_missed():
+    from rangecheck.studies.fit_classes import named
+
+    assert named("shape", 704) == ("not judged", [])
+
+
+def test_the_shadow_that_a_scan_s_own_ridge_casts_lies_behind_it_as_far_as_the_lamp_is_low():
+    from types import SimpleNamespace
+
+    from rangecheck.recover.causes import cast_by_scan
+
+    camera = PinholeCamera.from_field_of_view(SIZE, SIZE, 16.0)
+    _, rays = camera.pixel_rays()
+    away = AWAY_MM / rays[..., 2]
+    x = (away[..., None] * rays)[..., 0]
+    height, low = 6.0, np.radians(30.0)
+    # a ramp that ends in a cliff, the lamp 30 degrees above the plane behind it: the shadow is height / tan 30 long
+    ramp = np.where((x > -20.0) & (x < 0.0), height * (1.0 + x / 20.0), 0.0)
+    scan = RangeScan(
+        ((AWAY_MM - ramp) / rays[..., 2]).astype(np.float32), camera, brightness=np.full((SIZE, SIZE), 0.5, np.float32)
+    )
+    light = Light(np.array([-np.cos(low), 0.0, -np.sin(low)]), np.pi, np.array([0.0, 0.0, AWAY_MM]), 1e5, 0.1)
+    grid = scan_grid(scan)
+    lit = SimpleNamespace(problem=SimpleNamespace(lights=[light]))
+    hidden = cast_by_scan(grid, lit, grid.valid)
+    long = height / np.tan(low)
+    row = hidden[SIZE // 2]
+    across = grid.points[SIZE // 2, :, 0]
+    assert row[(across > 2.0) & (across < long - 2.0)].all()
+    assert not row[(across > long + 2.0) | (across < -2.0)].any()
+
+
 def test_on_strong_paint_nothing_is_judged_and_nothing_named():
     found = compare(ball_scan(paint=0.5), scale_mm=2.5)
     assert found.judged == 0.0 and found.regions == ()

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from rangecheck import rigid
+from rangecheck.arrays import FloatArray
 from rangecheck.errors import OutputError, ScanError
 from rangecheck.export.legend import INK, PAPER, ColourScale, colours_of, font, framed, letter_px
 from rangecheck.export.pictures import Picture, write_png
@@ -98,7 +99,7 @@ def _by_second_picture(path: str | Path, scan: RangeScan) -> tuple[dict[str, Any
     said = [
         f"{scan.name}: {100 * found.judged:.0f} % of it held against the second camera's picture, where steps of {found.level_mm:.2f} mm are named; elsewhere the "
         f"two pictures have too little in common; dents of {DENT_MM:g} mm would be named on {whole} of it, by radius",
-        *_places(found.regions),
+        *_places(found.regions, scan.world_from_scan),
     ]
     judged_dents = [{"radius_mm": radius, "judged": share} for share, radius in zip(found.dents.judged, RADII_MM)]
     about = {"by": "second picture", "judged": found.judged, "least_mm": found.level_mm, "dents": judged_dents}
@@ -114,7 +115,7 @@ def _by_shading(scan: RangeScan) -> tuple[dict[str, Any], tuple[Region, ...], li
         "least_mm": float(np.median(known)) if known.size else None,
         "paint": found.paint,
     }
-    return about, found.regions, [_judged_line(scan.name, found), *_places(found.regions)]
+    return about, found.regions, [_judged_line(scan.name, found), *_places(found.regions, scan.world_from_scan)]
 
 
 def _judged_line(name: str, found: Comparison) -> str:
@@ -130,17 +131,27 @@ def _judged_line(name: str, found: Comparison) -> str:
     return f"{name}: {100 * found.judged:.0f} % of it judged by its brightness to {JUDGED_MM:g} mm; {least}; elsewhere paint, shadow or grazing light hide the shape"
 
 
-def _places(regions: Sequence[Region]) -> list[str]:
+def _places(regions: Sequence[Region], world_from_scan: FloatArray) -> list[str]:
+    """Places in lines, in the world's frame, as findings give them."""
     lines = []
     for k, region in enumerate(regions[:_TOLD]):
-        x, y, z = region.middle_mm
+        x, y, z = rigid.move_points(world_from_scan, np.array([region.middle_mm]))[0]
         lines.append(
-            f"  {k + 1}: {region.kind} at {x:.1f}, {y:.1f}, {z:.1f} mm: {region.area_mm2:.0f} mm2, {region.length_mm:.0f} x {region.width_mm:.0f} mm, "
-            f"z {region.z:.1f}"
+            f"  {k + 1}: {_said_of(region)} at {x:.1f}, {y:.1f}, {z:.1f} mm, {region.length_mm:.0f} x {region.width_mm:.0f} mm large "
+            f"({abs(region.z):.1f} sigma, named from {region.asked:.1f})"
         )
     if len(regions) > _TOLD:
         lines.append(f"  and {len(regions) - _TOLD} more")
     return lines
+
+
+def _said_of(region: Region) -> str:
+    """What is wrong at a place, and by how much where it is the shape."""
+    if region.amount_mm is None:
+        return f"{region.kind} (nothing against the shape)"
+    if region.kind == "registration":
+        return f"registration, a step of {abs(region.amount_mm):.2f} mm"
+    return f"shape, the scan {abs(region.amount_mm):.2f} mm too {'deep' if region.amount_mm > 0.0 else 'high'}"
 
 
 def fit_scan(
@@ -161,7 +172,7 @@ def fit_scan(
         with reporter.stage(f"comparing {scan.name} with its picture"):
             found = compared(scan, response, scale_mm)
         results.append({"name": scan.name} | facts(found))
-        lines += told(scan.name, found)
+        lines += told(scan, found)
         fit &= not any(region.kind in AGAINST_SHAPE for region in found.regions)
         if pictures:
             write_png(pictures[scan.name], residual_picture(found, scan.name), force=force)
@@ -199,15 +210,15 @@ def facts(found: Comparison) -> dict[str, Any]:
     }
 
 
-def told(name: str, found: Comparison) -> list[str]:
+def told(scan: RangeScan, found: Comparison) -> list[str]:
     """A comparison in lines."""
     light = found.fitted.problem.lights[0]
     d = ", ".join(f"{v:.3f}" for v in light.direction)
-    lines = [_judged_line(name, found), f"  lamp towards {d} (scan's frame)"]
+    lines = [_judged_line(scan.name, found), f"  lamp towards {d} (scan's frame)"]
     lines += [f"  not determined: {said}" for said in found.fitted.statements]
     if not found.regions and found.judged >= _HARDLY:
         lines.append("  where it was judged the scan explains the picture: no place contradicts it")
-    return lines + _places(found.regions)
+    return lines + _places(found.regions, scan.world_from_scan)
 
 
 def residual_picture(found: Comparison, name: str) -> Picture:

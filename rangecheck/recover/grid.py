@@ -17,7 +17,7 @@ from rangecheck.recover.sight import Sight
 from rangecheck.scan import RangeScan
 
 #: neighbours further apart in range than this many pixel sizes lie on two sides of a depth jump
-_JUMP = 4.0
+JUMP = 4.0
 
 
 @dataclass(frozen=True, eq=False)

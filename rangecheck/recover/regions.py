@@ -18,7 +18,8 @@ LINE = 3.0
 
 @dataclass(frozen=True)
 class Region:
-    """A place that the scan does not explain: `kind` of KINDS, middle (3,) mm in the scan's frame, area and length mm, worst z, cells."""
+    """A place that the scan does not explain: `kind` of KINDS, middle (3,) mm in the scan's frame, area and length mm, worst z and its cell; asked: |z| from
+    which a place is named;  amount_mm: by how much the scan lies too deep there, or a step's height; None where the shape is not what is wrong"""
 
     kind: str
     middle_mm: tuple[float, float, float]
@@ -27,6 +28,8 @@ class Region:
     width_mm: float
     z: float
     cell: tuple[int, int]
+    asked: float = 0.0
+    amount_mm: float | None = None
 
 
 def inner(mask: BoolArray, cells: float) -> BoolArray:

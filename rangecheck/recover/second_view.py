@@ -110,11 +110,15 @@ def _judged(grid: ScanGrid, offset_mm: FloatArray, held: tuple[slice, slice], su
     # a jump is as wide as its disc: less is the picture's grain
     least = 0.25 * math.pi * WINDOW_MM**2
     stepped = regions_of(np.nan_to_num(jump) > level, jump / noise, grid.points, grid.spacing_mm, least)
-    whole = [replace(region, kind="shape") for region, _ in regions_of(sunken.named, sunken.z, grid.points, grid.spacing_mm, 0.0)]
+    # what has to be taken from the range is what it is too much
+    whole = [
+        replace(region, kind="shape", asked=sunken.level, amount_mm=-float(sunken.amount_mm[region.cell]))
+        for region, _ in regions_of(sunken.named, sunken.z, grid.points, grid.spacing_mm, 0.0)
+    ]
     # around a dent the range jumps, too
     reaches = [(grid.points[region.cell], float(sunken.radius_mm[region.cell]) + DISC_MM) for region in whole]
     alone = [
-        region for region, _ in stepped
+        replace(region, asked=level / noise, amount_mm=float(jump[region.cell])) for region, _ in stepped
         if all(float(np.linalg.norm(grid.points[region.cell] - middle)) > reach for middle, reach in reaches)
     ]  # fmt: skip
     regions = tuple(sorted([*whole, *alone], key=lambda region: -region.z))
