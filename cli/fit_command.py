@@ -25,7 +25,11 @@ from .common import Point, common, settings_from
     "--field", type=click.FloatRange(1, 170), help="The camera's horizontal field of view, degrees; else the scene's own, or 30."
 )
 @click.option("--lights", type=click.Path(), metavar="FILE", help="About where the lamps stand: x y z, one line a picture.")
-@click.option("--calibrate", type=click.Choice(["chrome", "matt"]), help="Only find the lamps, on a sphere of this kind.")
+@click.option(
+    "--calibrate",
+    type=click.Choice(["chrome", "matt", "bust"]),
+    help="Only find the lamps: on a chrome or matt --sphere (x right, y up, z to the camera), or on the bust itself, --on MESH (its own axes).",
+)
 @click.option(
     "--response", type=click.Choice(["linear", "srgb"]), default="linear", help="How the pictures' numbers follow light."
 )
@@ -57,7 +61,7 @@ from .common import Point, common, settings_from
     type=click.FloatRange(0, 90, min_open=True, max_open=True),
     help="The lamps' angular radius, degrees; 0.25 if not said.",
 )
-@click.option("--same-strength", is_flag=True, help="With --calibrate matt: the lamps are known to be of one strength.")
+@click.option("--same-strength", is_flag=True, help="With --calibrate matt or bust: the lamps are known to be of one strength.")
 @click.option("--spike", is_flag=True, help="Also fit a mirror's share; its highlight must be seen.")
 @click.option(
     "-o",

@@ -145,6 +145,57 @@ def test_a_camera_that_stood_elsewhere_is_found_within_its_interval_and_the_lamp
     assert elsewhere["residual_in_noises"] > 1.2 * document["residual_in_noises"] and elsewhere["world_from_camera"] is None
 
 
+def test_lamps_are_calibrated_on_the_bust_itself_and_the_list_serves_where_lamps_are_known(tmp_path, capsys):
+    surface = bumpy_ball()
+    write_mesh(surface, tmp_path / "ball.ply")
+    middle = surface.bounds_mm.mean(axis=0)
+    camera, pose = PinholeCamera.from_field_of_view(56, 56, 16.0), np.array(rigid.look_at((100, 80, 400.0), middle))
+    satin = Material("satin", K_lm=0.3, K_sl=0.1, sigma_um=0.6, correlation_um=4.0, wavelengths_um=(0.555,))
+    towards, strengths = np.array([[-0.4, 0.5, 0.8], [0.7, 0.3, 0.5]]), [2.0, 1.8]
+    pictures = []
+    for k, (d, e) in enumerate(zip(towards, strengths)):
+        lamp = Light(d, e, middle, 1e6, 0.25).source()
+        shown = Tracer(Scene(surface, (satin,), sources=(lamp,), smooth=True)).render(camera, pose, DIRECT)
+        pictures.append(save(tmp_path / f"{k}.png", np.nan_to_num(shown.radiance[..., 0]), 0.005, k))
+    seen = ["--on", str(tmp_path / "ball.ply"), "--unit", "mm", "--camera", "100,80,400", "--field", "16", "--noise", "0.005"]
+    capsys.readouterr()
+    assert exit_status(["fit", *pictures, *seen, "--calibrate", "bust", "-o", str(tmp_path / "lamps.txt"), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["kind"] == "bust" and found["converged"] and found["residual_in_noises"] < 1.1
+    truth = towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    off = np.degrees(np.arccos(np.clip((np.array(found["directions"]) * truth).sum(1), -1.0, 1.0)))
+    # two angles inside their intervals, made half again as wide
+    assert (off < 1.5 * np.sqrt(2.0) * np.array(found["within_deg"])).all() and max(found["within_deg"]) < 0.4
+    assert np.abs(np.array(found["strengths"]) / strengths * strengths[0] - 1.0).max() < 0.01
+    lamps = np.loadtxt(tmp_path / "lamps.txt", skiprows=1)
+    assert lamps == pytest.approx(np.array(found["directions"]), abs=1e-6)
+    document, _ = fitted(
+        capsys, *pictures, *seen, "--find", "strength", "--lights", str(tmp_path / "lamps.txt"), "-o", str(tmp_path / "m.toml")
+    )
+    assert document["residual_in_noises"] < 1.1
+    for wrong, why in (
+        (["--sphere", "45,45,40", "--calibrate", "bust"], "--on MESH"),
+        (["--on", str(tmp_path / "ball.ply"), "--calibrate", "chrome"], "--sphere"),
+        (["--sphere", "45,45,40", "--calibrate", "chrome", "--same-strength"], "no strengths"),
+    ):
+        assert exit_status(["fit", *pictures, *wrong, "-q"]) == 2 and why in capsys.readouterr().err
+
+
+def test_a_chrome_sphere_s_highlights_are_listed_as_lamps(tmp_path, capsys):
+    sight = sphere_sight((60, 58), 50, (120, 121), 0.5)
+    lamps = np.array([[0.3, 0.5, 0.81], [-0.4, 0.1, 0.9]])
+    lamps /= np.linalg.norm(lamps, axis=1, keepdims=True)
+    mirrored = 2 * sight.normals[:, 2:] * sight.normals - sight.views
+    names = [
+        save(tmp_path / f"{k}.png", sight.spread((mirrored @ lamp > np.cos(np.radians(6.0))).astype(float), 0.0), 0.0, k)
+        for k, lamp in enumerate(lamps)
+    ]
+    assert exit_status(["fit", *names, *SPHERE, "--calibrate", "chrome", "-o", str(tmp_path / "lamps.txt"), "--json"]) == 0
+    found = np.array(json.loads(capsys.readouterr().out)["directions"])
+    assert np.degrees(np.arccos((found * lamps).sum(1))).max() < 0.3
+    assert np.loadtxt(tmp_path / "lamps.txt", skiprows=1) == pytest.approx(found, abs=1e-6)
+
+
 def test_a_scene_s_part_gets_its_own_material_under_the_scene_s_lamp_and_surroundings(tmp_path, capsys):
     grey = "wavelengths_um = [0.555]\nsigma_um = 0.15\ncorrelation_um = 2.0\n"
     (tmp_path / "satin.toml").write_text(f"{grey}K_lm = 0.4\nK_sl = 0.25\n")

@@ -121,7 +121,7 @@ def test_photographed_spheres_give_their_lamps_and_predict_each_other(real_data)
     assert np.abs(gains / gains.mean() - 1.0).max() < 0.01
     # each picture is predicted by the others alone, under the mirror's lamps, of which the matt sphere has told nothing
     by_mirror = prediction_errors(pictures, outline, chrome)
-    assert by_mirror.max() < 0.04 and math.sqrt(float((by_mirror**2).mean())) < 0.02
+    assert by_mirror.max() < 0.0392 and math.sqrt(float((by_mirror**2).mean())) < 0.018
     # and better where its own part told of its lamp and beam: under the matt sphere's own lamps, and under the list with their beams
     assert prediction_errors(pictures, outline, matt.directions, beams=matt.beams).max() < 0.01
     by_list = prediction_errors(pictures, outline, listed, beams=matt.beams)

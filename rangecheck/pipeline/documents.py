@@ -283,9 +283,10 @@ def _documents() -> dict[str, tuple[Any, ...]]:
         ),
         "lights": (
             "`fit --calibrate`",
-            record(kind=one_of("chrome", "matt"), directions=many(POINT), inputs=NAMES, gains=maybe(many(NUMBER)), slope=maybe(NUMBER),
+            record(kind=one_of("chrome", "matt", "bust"), directions=many(POINT), inputs=NAMES, gains=maybe(many(NUMBER)), slope=maybe(NUMBER),
                    gloss=maybe(NUMBER), paint=maybe(NUMBER), rms=maybe(NUMBER), apart=maybe(many(NUMBER)), uneven=maybe(many(many(NUMBER))),
-                   closeness=maybe(many(NUMBER))),
+                   closeness=maybe(many(NUMBER)), within_deg=maybe(many(NUMBER)), strengths=maybe(many(NUMBER)), residual_in_noises=maybe(NUMBER),
+                   converged=maybe(FLAG), seconds=maybe(NUMBERS)),
         ),
         "explained": (
             "`fit` of a scan to its own brightness",

@@ -15,6 +15,7 @@ from rangecheck.arrays import FloatArray
 from rangecheck.errors import InputError, SettingError
 from rangecheck.files import read_bytes, write_bytes
 from rangecheck.optics import PinholeCamera, Sensor
+from rangecheck.pipeline.calibrating import check_kind, on_bust, on_sphere, three, within_deg
 from rangecheck.pipeline.fitting_scene import faces_of, field_of, lamps_of, simulator
 from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.subject import Subject, hashes, read_subject
@@ -47,7 +48,7 @@ def fit(
 ) -> Outcome:  # fmt: skip
     """Material and lamps from `pictures`, one lamp each, of a `sphere` (column, row, radius: parallel view) or a `model` seen from
     `camera_mm`; or, with neither, of a scan's brightness on its own surface, and where the two contradict each other.
-    `calibrate` (chrome or matt) finds the lamps of sphere pictures alone. `find`: what else is unknown, of pose, exposure, strength, distance, radius,
+    `calibrate` finds the lamps alone, on a chrome or matt sphere, or on the `model` itself (bust). `find`: what else is unknown, of pose, exposure, strength, distance, radius,
     ambient; `lamp_distance_mm` and `lamp_radius_deg` are where the lamps' begin.
     Of a modelled scene `part` is looked for; its camera and lamps are known from its file where neither `camera_mm` nor `lights` says otherwise."""
     if sphere is None and model is None and len(pictures) == 1 and Path(pictures[0]).suffix.lower() not in _PICTURES:
@@ -56,17 +57,17 @@ def fit(
         return fit_scan(pictures[0], out, response=response, unit=unit, scale_mm=scale_mm, force=force, reporter=reporter)
     if (sphere is None) == (model is None):
         raise SettingError("name what the pictures show, one of --sphere COLUMN,ROW,RADIUS and --on MESH", key="sphere")
+    if calibrate is not None:
+        check_kind(calibrate, sphere, model, same_strength)
     with reporter.stage("reading pictures"):
         values = [_linear(Path(p), response) for p in pictures]
     if len({v.shape for v in values}) > 1:
         raise InputError(pictures[0], "has another size than the other pictures; give pictures of one size")
     if sphere is not None:
         _refuse_beside(sphere, values[0].shape[1], values[0].shape[0])
-    if calibrate is not None:
-        if sphere is None:
-            raise SettingError("lamps are calibrated on a sphere; add --sphere COLUMN,ROW,RADIUS", key="calibrate")
-        return _calibrated(pictures, values, sphere, calibrate, out, force, same_strength)
-    if out is None:
+    if calibrate is not None and sphere is not None and calibrate != "bust":
+        return on_sphere(pictures, values, sphere, calibrate, out, force, same_strength)
+    if out is None and calibrate is None:
         raise SettingError("name the material file: -o FILE.toml", key="out")
     given = None if lights is None else _directions(Path(lights), len(pictures))
     shape = (values[0].shape[0], values[0].shape[1])
@@ -84,6 +85,8 @@ def fit(
     middle, size = sight.points.mean(axis=0), max(float(np.ptp(sight.points, axis=0).max()), 1e-6)
     distance = lamp_distance_mm or size * (_NEAR if "distance" in find else _FAR)
     known = subject.model if subject is not None and subject.model is not None and subject.model.lamps and given is None else None
+    if known is not None and calibrate is not None:
+        raise SettingError(f"{model} says where its lamps are; give --lights to have them looked for from there", key="lights")
     if known is not None and look is not None:
         if lamp_distance_mm is not None or lamp_radius_deg is not None:
             raise SettingError(f"{known.name} says where its lamps are; give --lights to place them otherwise", key="lights")
@@ -96,6 +99,8 @@ def fit(
         ("K_lm", "K_spike", "K_lobe", "sigma_um", "correlation_um") if spike else ("K_lm", "K_lobe", "sigma_um", "correlation_um")
     )
     free = {"strength": "irradiance"}
+    if calibrate is not None and not same_strength:
+        find = tuple(dict.fromkeys((*find, "strength")))
     unknowns = Unknowns(names, direction=known is None, one_camera=True, **{free.get(name, name): True for name in find})
     nodes = SEVEN_NODES if "radius" in find else ONE_NODE
     taken = photographs(sight, values, lamps, noise, None if look is None else look.caster, known is not None)
@@ -112,14 +117,17 @@ def fit(
                 reporter.note("the error of the light that was simulated is not in the intervals (light.model)")
         else:
             fitted, found = fit_looking(problem, look)
+    if calibrate is not None:
+        return on_bust(fitted, pictures, out, force, reporter.seconds)
     return _told(fitted, out, pictures, force, reporter, found)
 
 
 def _told(
-    fitted: Fitted, out: str, pictures: Sequence[str], force: bool, reporter: Reporter, camera: CameraFound | None
+    fitted: Fitted, out: str | None, pictures: Sequence[str], force: bool, reporter: Reporter, camera: CameraFound | None
 ) -> Outcome:
     from rangecheck.recover.outcome import material_of, material_toml
 
+    assert out is not None
     material, assumed = material_of(fitted, Path(out).stem)
     names = ", ".join(Path(p).name for p in pictures)
     write_bytes(out, material_toml(material, fitted, f"fitted to {names}").encode(), force=force)
@@ -128,7 +136,7 @@ def _told(
     estimates = [e for e in fitted.estimates if not e.name.startswith("camera")]
     lines += [_line(e.name, e.value, e.low, e.high) for e in estimates if "direction" not in e.name]
     lamps = [light.direction for light in fitted.problem.lights]
-    lines += [f"  light {k}: towards {_three(d)}{_within(fitted, k)}" for k, d in enumerate(lamps)]
+    lines += [f"  light {k}: towards {three(d)}{_within(fitted, k)}" for k, d in enumerate(lamps)]
     if camera is not None:
         lines += _camera_lines(camera)
     lines += assumed
@@ -147,15 +155,15 @@ def _told(
 
 def _camera_lines(camera: CameraFound) -> list[str]:
     pose = camera.world_from_camera
-    place = "not determined" if camera.within_mm is None else f"each within {_three(camera.within_mm, 2)} mm (95 %)"
+    place = "not determined" if camera.within_mm is None else f"each within {three(camera.within_mm, 2)} mm (95 %)"
     turn = (
         "not determined"
         if camera.turn_within_rad is None
         else f"any way within {math.degrees(camera.turn_within_rad):.2g} degrees (95 %)"
     )
     return [
-        f"  camera: at {_three(pose[:3, 3], 2)} mm, {place}",
-        f"    looking along {_three(pose[:3, 2])}, turned {turn}",
+        f"  camera: at {three(pose[:3, 3], 2)} mm, {place}",
+        f"    looking along {three(pose[:3, 2])}, turned {turn}",
     ]
 
 
@@ -166,16 +174,11 @@ def _line(name: str, value: float, low: float | None, high: float | None) -> str
 
 
 def _within(fitted: Fitted, k: int) -> str:
-    """How well a lamp's direction is known, in words: the larger half width of its two intervals."""
-    pair = [e for e in fitted.estimates if e.name.startswith(f"light {k} direction")]
-    widths = [0.5 * (e.high - e.low) for e in pair if e.low is not None and e.high is not None]
-    if not pair:
+    """How well a lamp's direction is known, in words."""
+    if not any(e.name.startswith(f"light {k} direction") for e in fitted.estimates):
         return ", as the scene says"
-    return f", within {math.degrees(max(widths)):.2g} degrees (95 %)" if len(widths) == len(pair) else ", not determined"
-
-
-def _three(vector: FloatArray, digits: int = 4) -> str:
-    return ", ".join(f"{v:.{digits}f}" for v in vector)
+    within = within_deg(fitted, k)
+    return ", not determined" if within is None else f", within {within:.2g} degrees (95 %)"
 
 
 def _linear(path: Path, response: str) -> FloatArray:
@@ -239,49 +242,3 @@ def _refuse_beside(sphere: tuple[float, float, float], width: int, height: int) 
             f"--sphere: a circle of radius {radius:g} around column {column:g}, row {row:g} is not in a picture of {width}x{height}; give its outline "
             "as the picture shows it", key="sphere",
         )  # fmt: skip
-
-
-def _calibrated(
-    pictures: Sequence[str], values: list[FloatArray], sphere: tuple[float, float, float], kind: str, out: str | None, force: bool,
-    same_strength: bool,
-) -> Outcome:  # fmt: skip
-    from rangecheck.recover.matt import lights_from_matt
-    from rangecheck.recover.matt_ball import PAINTED
-    from rangecheck.recover.spheres import Outline, light_from_chrome
-
-    outline = Outline((sphere[0], sphere[1]), sphere[2])
-    more: dict[str, Any] = {}
-    lines: list[str] = []
-    if kind == "chrome":
-        directions = np.array([light_from_chrome(v, outline) for v in values])
-    else:
-        found = lights_from_matt(values, outline, same_strength=same_strength)
-        directions = found.directions
-        more = {"gains": found.gains, "slope": found.slope, "gloss": found.surface.gloss, "paint": found.spread, "rms": found.rms,
-                "apart": found.apart, "uneven": found.uneven, "closeness": found.closeness}  # fmt: skip
-        lines.append(
-            f"one matt surface of slope {math.degrees(math.atan(found.slope)):.1f} degrees, its albedo varying by {100 * found.spread:.1f} % from pixel to pixel; "
-            f"residual {100 * found.rms:.2f} % of full scale"
-        )
-        if len(values) < PAINTED:
-            lines.append(
-                f"{len(values)} of pictures do not tell stains and uneven beams from the lamp's direction; {PAINTED} or more would"
-            )
-        else:
-            worst = int(np.argmax(np.hypot(*found.uneven.T)))
-            lines.append(
-                f"the beams are not even across the ball: {_three(found.uneven[worst], 2)} to the right and up over a radius in {Path(pictures[worst]).name}, the most"
-            )
-        if same_strength:
-            lines.append(
-                f"each picture alone would have its lamp's strength differ by at most {100 * np.abs(found.apart).max():.2f} %"
-            )
-    text = "".join(f"{' '.join(f'{v:.6f}' for v in d)}\n" for d in directions)
-    if out is not None:
-        write_bytes(out, f"{len(directions)}\n{text}".encode(), force=force)
-    gains = more.get("gains")
-    lines += [
-        f"{Path(p).name}: towards {_three(d)}" + ("" if gains is None else f", gain {gains[k]:.4f}")
-        for k, (p, d) in enumerate(zip(pictures, directions))
-    ]
-    return Outcome(document("lights", kind=kind, directions=directions, inputs=hashes(list(pictures)), **more), lines)

@@ -18,17 +18,17 @@ import numpy as np
 
 from rangecheck.arrays import FloatArray
 from rangecheck.errors import SceneError
-from rangecheck.recover.matt_ball import LEAST_COSINE, OUTLYING, MattBall
-from rangecheck.recover.matt_light import CLOSENESS, GLOSS, SLOPE, STRENGTH, UNEVEN, WIDTH, Surface, rough_matt, shown
+from rangecheck.recover.matt_ball import MattBall
+from rangecheck.recover.matt_light import CLOSENESS, LAMP_NUMBERS, STRENGTH, UNEVEN, Surface, rough_matt, shown
 from rangecheck.recover.sight import Sight, sphere_sight
 from rangecheck.recover.spheres import Outline
 
 #: cosine to the camera below which a pixel is not used
 _LEAST_FACING = 0.1
-_PIXELS, _FEW = 2000, 2000
-#: where a prediction's slope, light around, gloss and ln of its width begin, and their first steps
-_BEGIN, _FIRST = np.array([0.2, 0.02, 0.01, math.log(0.35)]), np.array([0.1, 0.03, 0.03, 0.3])
-_STEEPEST, _MOST_AROUND, _MOST_GLOSS = 0.8, 0.3, 0.3
+#: pixels that lamps are found on, and that a prediction is made from
+_PIXELS, _FEW = 2000, 1000
+#: cosine to the lamp below which a pixel sees only the room, and how many such tell of it
+_DARK, _SEVERAL = -0.1, 100
 
 
 class MattFit(NamedTuple):
@@ -114,56 +114,46 @@ def prediction_errors(
     beams: FloatArray | None = None,
     saturation: float = 1.0,
 ) -> FloatArray:
-    """(k,) rms error, parts of full scale, with which each picture is predicted by a surface fitted to all others under the lights given (k, 3).
+    """(k,) rms error, parts of full scale, with which each picture is predicted by what all others show under the lights given (k, 3).
 
-    Albedo of each pixel, slope, gloss and the room's light, which shadows show, come from the other pictures under one irradiance; nothing of the predicted
-    picture is used but its light: direction, and where given its beam (k, 3), `MattFit.beams`."""
-    from scipy.optimize import minimize
-
+    The others alone are fitted, lamps of one strength: the beam of each, the albedo of each pixel, the body, the strength, and the room's light, which
+    shadows show. Nothing of the predicted picture is used: its beam is taken to be even, and its lamp as close as the others. With `beams` (k, 3),
+    `MattFit.beams`, those are taken to be known, the predicted picture's own too."""
     shape = (np.shape(pictures[0])[0], np.shape(pictures[0])[1])
     whole = sphere_sight(outline.centre_px, outline.radius_px, shape)
     few = _thinned(whole, _FEW)
-    numbers = np.zeros((len(pictures), 6))
-    if beams is not None:
-        numbers[:, UNEVEN], numbers[:, CLOSENESS] = beams[:, :2], beams[:, 2]
+    unknown = slice(STRENGTH, LAMP_NUMBERS if beams is None else STRENGTH + 1)
     errors = []
     for k in range(len(pictures)):
         others = [j for j in range(len(pictures)) if j != k]
-
-        def ball(sight: Sight, others: list[int] = others) -> MattBall:
-            made = MattBall(sight, [pictures[j] for j in others], saturation, lights[others], rough=True, same_strength=True)
-            made.numbers, made.least = numbers[others], LEAST_COSINE
-            return made
-
-        training = ball(few)
-
-        def cost(found: FloatArray, training: MattBall = training) -> float:
-            _, matt, gloss, weight = _one_gain(training, found)
-            off = (training.paint(matt, gloss, weight) * matt + gloss - training.seen) / OUTLYING
-            return float((np.sqrt(1.0 + off[training.known] ** 2) - 1.0).mean())
-
-        found = minimize(
-            cost, _BEGIN, method="Nelder-Mead",
-            bounds=((0.0, _STEEPEST), (0.0, _MOST_AROUND), (0.0, _MOST_GLOSS), (math.log(0.1), math.log(0.7))),
-            options={"initial_simplex": _BEGIN + np.vstack([np.zeros(4), np.diag(_FIRST)]), "xatol": 3e-3, "fatol": 1e-4, "maxfev": 80},
-        )  # fmt: skip
-        every = ball(whole)
-        gain, matt, gloss, weight = _one_gain(every, found.x)
-        one, shine = shown(whole.normals, whole.views, lights[k], numbers[k], every.body())
-        predicted = every.paint(matt, gloss, weight) * gain * (one + found.x[1]) + gain * shine
+        room = _room(whole, [pictures[j] for j in others], lights[others])
+        lit = [np.asarray(pictures[j], np.float64) - room for j in others]
+        begin = lights[others] * np.array([[float(p.max())] for p in lit])
+        ball, every = (
+            MattBall(s, lit, saturation - room, begin, rough=True, same_strength=True, looked_for=unknown) for s in (few, whole)
+        )
+        if beams is not None:
+            ball.numbers[:, UNEVEN], ball.numbers[:, CLOSENESS] = beams[others, :2], beams[others, 2]
+        ball.solve()
+        every.take_over(ball)
+        matt, gloss = every.shown()
+        numbers = np.zeros(LAMP_NUMBERS)
+        numbers[STRENGTH] = every.numbers[:, STRENGTH].mean()
+        numbers[CLOSENESS] = every.numbers[:, CLOSENESS].mean()
+        if beams is not None:
+            numbers[UNEVEN], numbers[CLOSENESS] = beams[k, :2], beams[k, 2]
+        one, shine = shown(whole.normals, whole.views, lights[k], numbers, every.body())
+        predicted = every.paint(matt, gloss, every.weights(matt, gloss)) * one + shine + room
         values = np.asarray(pictures[k], np.float64).reshape(-1)[whole.pixel]
         errors.append(float(np.sqrt(((predicted - values)[values < saturation] ** 2).mean())))
     return np.array(errors)
 
 
-def _one_gain(ball: MattBall, found: FloatArray) -> tuple[float, FloatArray, FloatArray, FloatArray]:
-    """The gain that all pictures share under a surface of slope, light around, gloss and its width; matt and gloss (k, n) at it, weights (k, n)."""
-    ball.surface[[SLOPE, GLOSS, WIDTH]] = found[[0, 2, 3]]
-    matt, gloss = ball.shown()
-    matt = matt + found[1]
-    used = (matt > LEAST_COSINE) & ball.known
-    gain = float(np.median(ball.seen[used] / (matt + gloss)[used]))
-    return gain, gain * matt, gain * gloss, ball.weights(gain * matt, gain * gloss)
+def _room(sight: Sight, pictures: Sequence[FloatArray], lights: FloatArray) -> float:
+    """What pixels show that turn away from the lamp, beyond its penumbra: their median over all pictures, 0 where there are hardly any."""
+    dark = [np.asarray(p, np.float64).reshape(-1)[sight.pixel][sight.normals @ d < _DARK] for p, d in zip(pictures, lights)]
+    level = np.concatenate(dark)
+    return float(np.median(level)) if len(level) >= _SEVERAL else 0.0
 
 
 def gains_under(pictures: Sequence[FloatArray], outline: Outline, lights: FloatArray, *, saturation: float = 1.0) -> FloatArray:

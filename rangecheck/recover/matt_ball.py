@@ -43,7 +43,7 @@ _WIDTH, _WIDTHS, _STEEPEST, _WIDEST = math.log(0.35), 0.5, 0.8, 0.7
 
 
 class MattBall:
-    """seen (k, n), known (k, n) whether below saturation;  starts (k, 3) where the lamps begin, numbers (k, 6) of `matt_light` for each picture, surface (3,);
+    """seen (k, n), known (k, n) whether below saturation;  looked_for: those of a picture's numbers that are not known;  starts (k, 3) where the lamps begin, numbers (k, 6) of `matt_light` for each picture, surface (3,);
     noise of a pixel, spread of albedos, spreads of unevenness and closeness, as found."""
 
     def __init__(
@@ -55,9 +55,10 @@ class MattBall:
         *,
         rough: bool,
         same_strength: bool,
+        looked_for: slice = slice(0, LAMP_NUMBERS),
     ) -> None:
         values = np.array([np.asarray(p, np.float64).reshape(-1)[sight.pixel] for p in pictures])
-        self.sight, self.rough, self.same = sight, rough, same_strength
+        self.sight, self.rough, self.same, self.looked_for = sight, rough, same_strength, looked_for
         self.known: BoolArray = np.isfinite(values) & (values < saturation)
         self.seen = np.nan_to_num(values)
         several = len(values) >= PAINTED
@@ -199,6 +200,6 @@ class MattBall:
         right[wide] += (self.noise / _WIDTHS) ** 2 * (self.surface[WIDTH] - _WIDTH)
 
     def _free(self, places: IntArray, body: IntArray) -> IntArray:
-        numbers = places if self.beams else places[:, :3]
+        numbers = (places if self.beams else places[:, : STRENGTH + 1])[:, self.looked_for]
         surface = body if self.rough and self.beams else body[: 1 if self.rough else 0]
         return np.unique(np.concatenate([numbers.ravel(), surface]))
