@@ -9,6 +9,7 @@ derivatives are exact for what is drawn.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -165,13 +166,16 @@ def _footprints(
         solid_angle = np.linalg.norm(area, axis=1)
         # facets of one normal mirror parallel rays in parallel: there the footprint is next to nothing, but not nothing
         footprints = np.nan_to_num(np.sqrt(np.maximum(solid_angle, _LEAST_SOLID_ANGLE) / np.pi))
+        # d |right x down| = d right . (down x area) + d down . (area x right), over |area|
+        per = 1.0 / (2.0 * np.pi * solid_angle * footprints)[:, None]
+        on_right, on_down = np.cross(down, area) * per, np.cross(area, right) * per
+        to_right, to_below = (_difference_matrix(seen, shape, axis) for axis in (1, 0))
         slopes = np.zeros((len(seen), POSE_NUMBERS))
         for k in range(POSE_NUMBERS):
             by_normal, by_ray = by_pose[:, 1, :, k], -by_pose[:, 2, :, k]
-            by_cosine = (by_ray * normals).sum(1)[:, None] + (rays * by_normal).sum(1)[:, None]
-            right_by, down_by = neighbours(by_ray - 2.0 * (by_cosine * normals + cosine * by_normal))
-            area_by = np.cross(right_by, down) + np.cross(right, down_by)
-            slopes[:, k] = (area * area_by).sum(1) / (2.0 * np.pi * solid_angle * footprints)
+            by_cosine = (by_ray * normals + rays * by_normal).sum(1)[:, None]
+            by = by_ray - 2.0 * (by_cosine * normals + cosine * by_normal)
+            slopes[:, k] = ((to_right @ by) * on_right + (to_below @ by) * on_down).sum(1)
     slopes[~(solid_angle > _LEAST_SOLID_ANGLE)] = 0.0
     return np.nan_to_num(spans), footprints, slopes
 
@@ -186,6 +190,24 @@ def _differences(grid: FloatArray, axis: int) -> FloatArray:
     ahead[tuple(low)], behind[tuple(high)] = step, step
     both = 0.5 * (ahead + behind)
     return np.where(np.isnan(both), np.where(np.isnan(ahead), behind, ahead), both)
+
+
+def _difference_matrix(seen: IntArray, shape: tuple[int, int], axis: int) -> Any:
+    """(n, n) sparse: `_differences` of what the pixels `seen` hold; rows of pixels without a neighbour are empty."""
+    from scipy.sparse import csr_array
+
+    n, (h, w) = len(seen), shape
+    place = np.full((h + 2, w + 2), -1)
+    place[1 + seen // w, 1 + seen % w] = np.arange(n)
+    step = (0, 1) if axis else (1, 0)
+    after = place[1 + seen // w + step[0], 1 + seen % w + step[1]]
+    before = place[1 + seen // w - step[0], 1 + seen % w - step[1]]
+    each = np.where((after >= 0) & (before >= 0), 0.5, 1.0)
+    ahead, behind = np.where(after >= 0, each, 0.0), np.where(before >= 0, each, 0.0)
+    here = np.arange(n)
+    columns = np.stack([np.maximum(before, 0), here, np.maximum(after, 0)], axis=1)
+    weights = np.stack([-behind, behind - ahead, ahead], axis=1)
+    return csr_array((weights.ravel(), columns.ravel(), np.arange(0, 3 * n + 1, 3)), shape=(n, n))
 
 
 def _by_pose(
