@@ -9,9 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from test_recover import EVERYTHING, bumpy_ball, problem_on
+from test_transport import ball, floor
 
 from rangecheck import rigid
-from rangecheck.optics import PinholeCamera
+from rangecheck.optics import OrthographicCamera, PinholeCamera
 from rangecheck.recover.lights import ONE_NODE, SEVEN_NODES, Light
 from rangecheck.recover.matt_light import BODY_NUMBERS, LAMP_NUMBERS, Surface, shown, slopes
 from rangecheck.recover.problem import Guess, Unknowns
@@ -116,6 +117,19 @@ def test_a_mirrored_lamp_s_picture_changes_with_the_pose_as_its_derivative_says(
         mine = start.spread(slopes[:, k])
         assert same.sum() > 0.9 * len(start)
         assert np.abs(measured - mine)[same].max() < 1e-5 * np.abs(mine[same]).max()
+
+
+def test_a_flat_plate_mirrors_parallel_rays_in_parallel_wherever_the_camera_stands():
+    scene = Scene(floor(), (Material("grey", K_lm=0.5, wavelengths_um=(0.555,)),))
+    sight = see(scene, OrthographicCamera(20, 20, 10.0, 9.5, 9.5), rigid.look_at((30.0, 300.0, 40.0), (0.0, 0.0, 0.0)))
+    assert len(sight) > 100 and 0.0 <= sight.footprints.max() < 1e-5
+    assert np.isfinite(sight.footprints_by_pose).all() and np.abs(sight.footprints_by_pose).max() < 1e-4
+
+
+def test_of_a_pixel_without_neighbours_no_footprint_is_known_nor_how_it_moves():
+    scene = Scene(ball(1, 0.5), (Material("grey", K_lm=0.5, wavelengths_um=(0.555,)),))
+    sight = see(scene, PinholeCamera.from_field_of_view(5, 5, 10.0), rigid.look_at((0.0, 0.0, 100.0), (0.0, 0.0, 0.0)))
+    assert len(sight) == 1 and sight.footprints[0] == 0.0 and not sight.footprints_by_pose.any()
 
 
 @pytest.mark.parametrize("sideways", [False, True], ids=["in front", "at the rim"])

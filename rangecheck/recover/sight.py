@@ -167,7 +167,7 @@ def _footprints(
         # facets of one normal mirror parallel rays in parallel: there the footprint is next to nothing, but not nothing
         footprints = np.nan_to_num(np.sqrt(np.maximum(solid_angle, _LEAST_SOLID_ANGLE) / np.pi))
         # d |right x down| = d right . (down x area) + d down . (area x right), over |area|
-        per = 1.0 / (2.0 * np.pi * solid_angle * footprints)[:, None]
+        per = 1.0 / np.where(solid_angle > _LEAST_SOLID_ANGLE, 2.0 * np.pi * solid_angle * footprints, np.inf)[:, None]
         on_right, on_down = np.cross(down, area) * per, np.cross(area, right) * per
         to_right, to_below = (_difference_matrix(seen, shape, axis) for axis in (1, 0))
         slopes = np.zeros((len(seen), POSE_NUMBERS))
@@ -176,8 +176,7 @@ def _footprints(
             by_cosine = (by_ray * normals + rays * by_normal).sum(1)[:, None]
             by = by_ray - 2.0 * (by_cosine * normals + cosine * by_normal)
             slopes[:, k] = ((to_right @ by) * on_right + (to_below @ by) * on_down).sum(1)
-    slopes[~(solid_angle > _LEAST_SOLID_ANGLE)] = 0.0
-    return np.nan_to_num(spans), footprints, slopes
+    return np.nan_to_num(spans), footprints, np.nan_to_num(slopes)
 
 
 def _differences(grid: FloatArray, axis: int) -> FloatArray:
