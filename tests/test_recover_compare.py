@@ -75,16 +75,19 @@ def test_a_dent_that_the_picture_does_not_show_is_named_at_its_place_with_its_de
 
 
 def test_the_picture_of_what_is_left_is_red_where_the_scan_lies_too_deep_and_blue_where_it_stands_too_high(clean):
-    from rangecheck.pipeline.explained import residual_picture
+    from rangecheck.pipeline.explained import residual_picture, told
 
     scan, found = clean
     for depth, more, less in ((1.0, 0, 2), (-1.0, 2, 0)):
         dent = compare(
             dented(scan, scan.grid_points_mm[110, 90], depth_mm=depth, radius_mm=10.0), scale_mm=2.5, fitted=found.fitted
         )
+        said = "\n".join(told(scan, dent))
+        assert f"mm too {'deep' if depth > 0.0 else 'high'} at" in said and f"named from {dent.level:.1f}" in said
         side = np.sign(dent.z[dent.regions[0].cell])
         assert side == np.sign(depth)
-        wholly = replace(dent, z=np.where(np.isfinite(dent.z), 1.5 * side * dent.level, np.nan), regions=())
+        assert np.sign(dent.hollow[dent.regions[0].cell]) == side
+        wholly = replace(dent, hollow=np.where(np.isfinite(dent.z), 1.5 * side * dent.level, np.nan), regions=())
         # without the scale at the right
         shown = residual_picture(wholly, "ball").astype(int)[:, :700]
         assert (shown[..., more] - shown[..., less] > 60).mean() > 0.2
@@ -178,6 +181,8 @@ def test_check_names_the_place_in_mm_and_explains_it(tmp_path, clean, capsys):
         if name == "clean":
             assert row["findings"] == []
             continue
+        [region] = row["pictures"][0]["regions"]
+        assert region["amount_mm"] == pytest.approx(1.0, abs=0.35) and abs(region["z"]) > region["asked"]
         [found] = row["findings"]
         assert found["code"] == "scan-contradicts-picture" and found["severity"] == "warning"
         assert np.linalg.norm(np.array(found["places_mm"]) - scan.grid_points_mm[110, 90], axis=1).max() < 12.0

@@ -93,11 +93,21 @@ def test_a_step_is_named_on_its_line_as_one_of_registration(pair):
 
 
 def test_the_jump_of_a_step_is_its_height_and_of_a_plane_nothing():
-    step = np.zeros((40, 40))
+    step, even = np.zeros((40, 40)), np.ones((40, 40))
     step[:, 20:] = 0.7
-    found = jumps(step, 6.0)
+    found, deviation = jumps(step, even, 6.0)
     assert np.nanmax(found) == pytest.approx(0.7) and found[20, 5] == pytest.approx(0.0, abs=1e-12)
-    assert np.isnan(jumps(np.full((40, 40), np.nan), 6.0)).all()
+    # means of two halves of variance 1
+    assert np.nanmax(deviation) == pytest.approx(np.sqrt(2.0))
+    assert np.isnan(jumps(np.full((40, 40), np.nan), even, 6.0)[0]).all()
+
+
+def test_offsets_of_windows_that_hardly_agree_count_for_little_in_a_jump():
+    wrong, variance = np.zeros((40, 40)), np.ones((40, 40))
+    wrong[:, 20:24], variance[:, 20:24] = 0.7, 100.0
+    trusted, _ = jumps(wrong, np.ones((40, 40)), 6.0)
+    found, _ = jumps(wrong, variance, 6.0)
+    assert np.nanmax(trusted) > 0.5 and np.nanmax(found[:, :19]) < 0.1 * 0.7
 
 
 def test_pictures_that_show_nothing_alike_or_are_of_another_size_are_refused(pair):

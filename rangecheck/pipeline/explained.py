@@ -37,7 +37,7 @@ _SECOND_CELLS = 900_000
 _TOLD = 12
 #: of the picture of what is left: levels to either side, greys of what was not compared, cells around, and about its longer side in pixels
 _SPAN, _FADED, _MARGIN, _SIDE = 2.0, (120.0, 235.0), 4, 720
-_MEANS = "red: the scan lies deeper than its picture shows, blue: higher, grey: not compared"
+_MEANS = "red: the scan lies deeper than its picture shows, blue: higher; named beyond 1; grey: not compared"
 #: share of a scan below which it is not said to be judged
 _HARDLY = 0.005
 _CODE = "scan-contradicts-picture"
@@ -97,9 +97,9 @@ def _by_second_picture(path: str | Path, scan: RangeScan) -> tuple[dict[str, Any
     found: Agreement = second_view(linear, right, capture.right_view, step=_step(scan, _SECOND_CELLS))
     whole = ", ".join(f"{100 * share:.0f} % ({radius:g} mm)" for share, radius in zip(found.dents.judged, RADII_MM))
     said = [
-        f"{scan.name}: {100 * found.judged:.0f} % of it held against the second camera's picture, where steps of {found.level_mm:.2f} mm are named; elsewhere the "
-        f"two pictures have too little in common; dents of {DENT_MM:g} mm would be named on {whole} of it, by radius",
-        *_places(found.regions, scan.world_from_scan),
+        f"{scan.name}: held against the second camera's picture, steps of {found.level_mm:.2f} mm would be named on {100 * found.judged:.0f} % of it, dents of "
+        f"{DENT_MM:g} mm on {whole}, by radius; elsewhere there is too little paint, or gloss that the two see in different places, or a rim",
+        *_places(found.regions, scan.world_from_scan, max(found.judged, *found.dents.judged)),
     ]
     judged_dents = [{"radius_mm": radius, "judged": share} for share, radius in zip(found.dents.judged, RADII_MM)]
     about = {"by": "second picture", "judged": found.judged, "least_mm": found.level_mm, "dents": judged_dents}
@@ -115,7 +115,7 @@ def _by_shading(scan: RangeScan) -> tuple[dict[str, Any], tuple[Region, ...], li
         "least_mm": float(np.median(known)) if known.size else None,
         "paint": found.paint,
     }
-    return about, found.regions, [_judged_line(scan.name, found), *_places(found.regions, scan.world_from_scan)]
+    return about, found.regions, [_judged_line(scan.name, found), *_places(found.regions, scan.world_from_scan, found.judged)]
 
 
 def _judged_line(name: str, found: Comparison) -> str:
@@ -131,8 +131,10 @@ def _judged_line(name: str, found: Comparison) -> str:
     return f"{name}: {100 * found.judged:.0f} % of it judged by its brightness to {JUDGED_MM:g} mm; {least}; elsewhere paint, shadow or grazing light hide the shape"
 
 
-def _places(regions: Sequence[Region], world_from_scan: FloatArray) -> list[str]:
-    """Places in lines, in the world's frame, as findings give them."""
+def _places(regions: Sequence[Region], world_from_scan: FloatArray, judged: float) -> list[str]:
+    """Places in lines, in the world's frame, as findings give them; judged: share of the scan."""
+    if not regions and judged >= _HARDLY:
+        return ["  where it was judged the scan explains the picture: no place contradicts it"]
     lines = []
     for k, region in enumerate(regions[:_TOLD]):
         x, y, z = rigid.move_points(world_from_scan, np.array([region.middle_mm]))[0]
@@ -176,7 +178,7 @@ def fit_scan(
         fit &= not any(region.kind in AGAINST_SHAPE for region in found.regions)
         if pictures:
             write_png(pictures[scan.name], residual_picture(found, scan.name), force=force)
-            lines.append(f"{pictures[scan.name]}: {_MEANS}; beyond 1 a place is named")
+            lines.append(f"{pictures[scan.name]}: {_MEANS}")
     return Outcome(document("explained", fit=fit, scans=results, inputs=hashes([path]), seconds=reporter.seconds), lines, fit)
 
 
@@ -216,13 +218,11 @@ def told(scan: RangeScan, found: Comparison) -> list[str]:
     d = ", ".join(f"{v:.3f}" for v in light.direction)
     lines = [_judged_line(scan.name, found), f"  lamp towards {d} (scan's frame)"]
     lines += [f"  not determined: {said}" for said in found.fitted.statements]
-    if not found.regions and found.judged >= _HARDLY:
-        lines.append("  where it was judged the scan explains the picture: no place contradicts it")
-    return lines + _places(found.regions, scan.world_from_scan)
+    return lines + _places(found.regions, scan.world_from_scan, found.judged)
 
 
 def residual_picture(found: Comparison, name: str) -> Picture:
-    """(H, W, 3) uint8: z of the strongest false relief in units of the level, over the scan's faded brightness where nothing was compared; places
+    """(H, W, 3) uint8: z of the strongest false hollow in units of the level, over the scan's faded brightness where nothing was compared; places
     that are named have a ring, and the number that they have in the list."""
     from PIL import Image, ImageDraw
 
@@ -235,8 +235,8 @@ def residual_picture(found: Comparison, name: str) -> Picture:
     light = np.sqrt(np.clip(np.nan_to_num(found.grid.picture) / max(float(np.nanmax(found.grid.picture)), 1e-9), 0.0, 1.0))
     faded = np.rint(_FADED[0] + (_FADED[1] - _FADED[0]) * light).astype(np.uint8)
     shown = np.where(valid[..., None], faded[..., None], np.array(PAPER, np.uint8))
-    compared = np.isfinite(found.z)
-    shown = np.where(compared[..., None], colours_of(found.z / found.level, -_SPAN, _SPAN, "RdBu_r"), shown)[held]
+    compared = np.isfinite(found.hollow)
+    shown = np.where(compared[..., None], colours_of(found.hollow / found.level, -_SPAN, _SPAN, "RdBu_r"), shown)[held]
     times = max(1, round(_SIDE / max(shown.shape[:2])))
     image = Image.fromarray(np.repeat(np.repeat(shown.astype(np.uint8), times, axis=0), times, axis=1))
     draw = ImageDraw.Draw(image)
@@ -248,5 +248,5 @@ def residual_picture(found: Comparison, name: str) -> Picture:
         draw.text(
             (x + 0.8 * reach, y - 0.8 * reach), str(k + 1), font=letters, fill=INK, anchor="lb", stroke_width=2, stroke_fill=PAPER
         )
-    scale = ColourScale(-_SPAN, _SPAN, "of level", "RdBu_r", (-1.0, 1.0))
+    scale = ColourScale(-_SPAN, _SPAN, f"{found.level:.1f} sigma", "RdBu_r", (-1.0, 1.0))
     return framed(np.asarray(image), f"{name}: shape against brightness", _MEANS, scale)

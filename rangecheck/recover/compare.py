@@ -48,12 +48,14 @@ _FREEDOMS = (100.0, 50.0, 30.0, 20.0, 15.0, 12.0, 10.0)
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """regions, the worst first;  z (h, w) of the strongest template, NaN where nothing was compared;  amount_mm (h, w) of it;  least_mm (h, w) the dent that
+    """regions, the worst first;  z (h, w) of the strongest template, NaN where nothing was compared;  hollow (h, w) that of the strongest dent: above 0 where the
+    scan lies too deep;  amount_mm (h, w) of it;  least_mm (h, w) the dent that
     would be named there;  residual (h, w) = ln(seen/predicted);  judged: share of the valid cells;  level: |z| from which a place is named;
     paint: spread of the residual in the scale of dents;  fitted;  grid"""
 
     regions: tuple[Region, ...]
     z: FloatArray
+    hollow: FloatArray
     amount_mm: FloatArray
     least_mm: FloatArray
     residual: FloatArray
@@ -93,7 +95,7 @@ def compare(scan: RangeScan, *, step: int = 1, scale_mm: float | None = None, fi
     # nearer to rims the slow part is the mean of one side
     compared = inner(used, 1.5 * radii[0])
     none: FloatArray = np.zeros(used.shape)
-    best, amount, least, level = none, none, none + np.inf, 0.0
+    best, hollow, amount, least, level = none, none, none, none + np.inf, 0.0
     evidence: dict[str, FloatArray] = dict.fromkeys(AGAINST_SHAPE, none - np.inf)
     for radius in radii:
         spread = scale / grid.spacing_mm
@@ -103,6 +105,7 @@ def compare(scan: RangeScan, *, step: int = 1, scale_mm: float | None = None, fi
             level = max(level, here)
             if kind == "shape":
                 least = np.minimum(least, np.maximum(here * found.deviation, LEAST_MM))
+                hollow = np.where(np.abs(found.z) > np.abs(hollow), found.z, hollow)
             stronger = np.abs(found.z) > np.abs(best)
             best, amount = np.where(stronger, found.z, best), np.where(stronger, found.amount, amount)
             evidence[kind] = np.maximum(evidence[kind], found.evidence)
@@ -121,8 +124,8 @@ def compare(scan: RangeScan, *, step: int = 1, scale_mm: float | None = None, fi
     regions += shadow_regions(shaded & ~cast, seen, judged, grid, filters.spread, radius_mm)
     regions = [replace(region, asked=level) for region in regions]
     share = float(judged.sum() / max(1, grid.valid.sum()))
-    best, amount, least = (np.where(compared, v, np.nan) for v in (best, amount, least))
-    return Comparison(tuple(regions), best, amount, least, residual, share, level, filters.spread, fitted, grid)
+    best, hollow, amount, least = (np.where(compared, v, np.nan) for v in (best, hollow, amount, least))
+    return Comparison(tuple(regions), best, hollow, amount, least, residual, share, level, filters.spread, fitted, grid)
 
 
 def _shading_slopes(

@@ -5,9 +5,13 @@ A range that is wrong by d moves its place in the second picture along the epipo
 in logarithms of light, correlate best over a Gaussian window (normalised cross-correlation, so that each window has its own gain), between the offsets
 tried by a parabola. Where paint has no structure, or the cameras see a gloss, they do not correlate and the place is not judged.
 
-Steps are named by the jump of d: the largest difference between its means over two halves of a disc, over all directions. Slow changes of d are the
-calibration's; a dent has a ring of jumps, two badly joined pieces a line of them. The noise is that of the jump over the picture itself (median
-absolute), and the level is Bonferroni's for as many places as discs fit into what is judged. Its tails are longer than a normal one's, so nothing below
+Of noise s in what differs, d has the variance s^2 / sum (dL/dd)^2, which is (1 - c^2) over the bend of the correlation c at its top (Cramer and Rao's bound for a
+delay): the less two windows agree, as where the cameras see a gloss in different places, the less their offset counts.
+
+Steps are named by the jump of d: the most certain difference between its means over two halves of a disc, over all directions. Slow changes of d are the
+calibration's; a dent has a ring of jumps, two badly joined pieces a line of them. The scale of their deviations is taken from the picture itself (median
+absolute), amounts s0 that are found where they are small count as found everywhere, and z = jump / sqrt(deviation^2 + s0^2) is named from Bonferroni's level for as
+many places as discs fit into what is judged. Its tails are longer than a normal one's, so nothing below
 LEAST_MM is named either. Where a false shape changes much within one window, the pictures no longer correlate and the place drops out of what is judged: whole
 dents are therefore looked for by filters of their own shape (`dents`), which judge more of the scan. Scan frame, millimetres.
 """
@@ -37,17 +41,21 @@ LEAST_MM, CHANCE = 0.15, 0.01
 _CORRELATED, _FILLED = 0.85, 0.5
 _DIRECTIONS = 8
 _NORMAL_MAD = 0.6744897501960817
+#: 1 - c^2 of windows that agree as well as can be
+_LEAST_APART = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """offset_mm (h, w) by which the range would have to change, NaN where not judged;  jump_mm (h, w);  noise_mm: of the jump;  level_mm: above which a
-    place is named;  places: discs that fit into what is judged;  judged: its share of the valid cells;  spacing_mm, step: of the grid;  dents: whole dents, with
+    """offset_mm (h, w) by which the range would have to change, NaN where not judged;  jump_mm, z (h, w);  noise_mm: of a jump, median;  level: z from which a
+    place is named;  level_mm: the jump that is, median;  places: discs that fit into what is judged;  judged: its share of the valid cells;  spacing_mm, step: of the grid;  dents: whole dents, with
     what of the scan is judged for them;  regions, the clearest first"""
 
     offset_mm: FloatArray
     jump_mm: FloatArray
+    z: FloatArray
     noise_mm: float
+    level: float
     level_mm: float
     places: int
     judged: float
@@ -95,22 +103,33 @@ def second_view(scan: RangeScan, picture: FloatArray, view: View, *, step: int =
     offset_mm[grid.valid] = np.where(believed, found, np.nan)
     # windows at rims are one-sided
     offset_mm[~inner(grid.valid, 0.5 * sigma)] = np.nan
-    return _judged(grid, offset_mm, pair.held, dents(pair))
+    variance = np.full(grid.valid.shape, np.nan)
+    variance[grid.valid] = np.maximum(1.0 - peak**2, _LEAST_APART) / np.where(bend < 0.0, -bend, np.nan)
+    return _judged(grid, offset_mm, variance, pair.held, dents(pair))
 
 
-def _judged(grid: ScanGrid, offset_mm: FloatArray, held: tuple[slice, slice], sunken: Dents) -> Agreement:
-    jump = np.full(grid.valid.shape, np.nan)
-    jump[held] = jumps(offset_mm[held], DISC_MM / grid.spacing_mm)
+def _judged(grid: ScanGrid, offset_mm: FloatArray, variance: FloatArray, held: tuple[slice, slice], sunken: Dents) -> Agreement:
+    jump, z = (np.full(grid.valid.shape, np.nan) for _ in range(2))
+    jump[held], unscaled = jumps(offset_mm[held], variance[held], DISC_MM / grid.spacing_mm)
     known = np.isfinite(jump)
     count = int(known.sum())
     places = max(1, round(count * grid.spacing_mm**2 / (math.pi * DISC_MM**2)))
-    noise = float(np.median(jump[known])) / _NORMAL_MAD if count else math.nan
-    # the jump is the largest of several directions, each of either sign
-    level = max(LEAST_MM, noise * NormalDist().inv_cdf(1.0 - CHANCE / (2.0 * _DIRECTIONS * places)))
+    # the jump is the most certain of several directions, each of either sign
+    level = NormalDist().inv_cdf(1.0 - CHANCE / (2.0 * _DIRECTIONS * places))
+    noise = level_mm = math.nan
+    if count:
+        deviation = np.full(grid.valid.shape, np.nan)
+        deviation[held] = unscaled
+        deviation *= float(np.median((jump / deviation)[known])) / _NORMAL_MAD
+        well = known & (deviation <= np.median(deviation[known]))
+        whole_deviation = np.hypot(deviation, float(np.median(jump[well])) / _NORMAL_MAD)
+        z = jump / whole_deviation
+        noise = float(np.median(whole_deviation[known]))
+        level_mm = max(LEAST_MM, level * noise)
     # a jump is as wide as its disc: less is the picture's grain
     least = 0.25 * math.pi * WINDOW_MM**2
-    stepped = regions_of(np.nan_to_num(jump) > level, jump / noise, grid.points, grid.spacing_mm, least)
-    # what has to be taken from the range is what it is too much
+    over = (np.nan_to_num(z) > level) & (np.nan_to_num(jump) > LEAST_MM)
+    stepped = regions_of(over, z, grid.points, grid.spacing_mm, least)
     whole = [
         replace(region, kind="shape", asked=sunken.level, amount_mm=-float(sunken.amount_mm[region.cell]))
         for region, _ in regions_of(sunken.named, sunken.z, grid.points, grid.spacing_mm, 0.0)
@@ -118,31 +137,39 @@ def _judged(grid: ScanGrid, offset_mm: FloatArray, held: tuple[slice, slice], su
     # around a dent the range jumps, too
     reaches = [(grid.points[region.cell], float(sunken.radius_mm[region.cell]) + DISC_MM) for region in whole]
     alone = [
-        replace(region, asked=level / noise, amount_mm=float(jump[region.cell])) for region, _ in stepped
+        replace(region, asked=level, amount_mm=float(jump[region.cell])) for region, _ in stepped
         if all(float(np.linalg.norm(grid.points[region.cell] - middle)) > reach for middle, reach in reaches)
     ]  # fmt: skip
     regions = tuple(sorted([*whole, *alone], key=lambda region: -region.z))
     share = count / max(1, int(grid.valid.sum()))
-    return Agreement(offset_mm, jump, noise, level, places, share, grid.spacing_mm, grid.step, sunken, regions)
+    return Agreement(offset_mm, jump, z, noise, level, level_mm, places, share, grid.spacing_mm, grid.step, sunken, regions)
 
 
-def jumps(values: FloatArray, radius: float) -> FloatArray:
-    """(h, w) the largest absolute difference of means over two halves of a disc (radius in cells), NaN where a half is not filled."""
+def jumps(values: FloatArray, variance: FloatArray, radius: float) -> tuple[FloatArray, FloatArray]:
+    """(h, w) the most certain absolute difference of means over two halves of a disc (radius in cells), weighted by one over the values' variance, and its
+    deviation as if each half were one value; NaN where a half is not filled."""
     from scipy.signal import fftconvolve
 
     reach = math.ceil(radius)
     y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
     disc = np.hypot(x, y) <= radius
-    known = np.isfinite(values)
-    filled, weight = np.where(known, values, 0.0), known.astype(float)
-    largest = np.full(values.shape, np.nan)
+    known = np.isfinite(values) & np.isfinite(variance)
+    # sums by Fourier transforms err by parts of the largest term
+    least = 1e-3 * float(np.median(variance[known])) if known.any() else 1.0
+    weight = np.where(known, 1.0 / np.maximum(np.where(known, variance, 1.0), least), 0.0)
+    filled, ones = np.where(known, values, 0.0) * weight, known.astype(float)
+    jump, deviation = (np.full(values.shape, np.nan) for _ in range(2))
     for angle in np.arange(_DIRECTIONS) * math.pi / _DIRECTIONS:
         side = math.cos(angle) * x + math.sin(angle) * y
-        means, full = [], known.copy()
+        means, squares, full = [], np.zeros(values.shape), known.copy()
         for half in (disc & (side > 0.5), disc & (side < -0.5)):
             kernel = half[::-1, ::-1].astype(float)
-            count = fftconvolve(weight, kernel, mode="same")
-            means.append(fftconvolve(filled, kernel, mode="same") / np.maximum(count, 0.5))
+            count, total, top = (fftconvolve(field, kernel, mode="same") for field in (ones, weight, filled))
             full &= count > _FILLED * half.sum()
-        largest = np.fmax(largest, np.where(full, np.abs(means[0] - means[1]), np.nan))
-    return largest
+            total = np.where(full, total, 1.0)
+            means.append(top / total)
+            squares += count / total
+        apart, sure = np.abs(means[0] - means[1]), np.sqrt(np.maximum(squares, 0.0))
+        surer = full & ~(jump * sure >= apart * deviation)
+        jump, deviation = np.where(surer, apart, jump), np.where(surer, sure, deviation)
+    return jump, deviation

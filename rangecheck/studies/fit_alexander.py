@@ -3,7 +3,8 @@
 The scan is the structured-light bust of the real data, in the left camera's frame; its picture under the white projector lies on its grid. First material
 and lamp are fitted to that picture, and it is said how much of the picture they explain: paint decides what shading can show. Then the scan is held against the
 right camera's picture. Places and directions of what is planted are drawn from a seed among the places that the unaltered scan is judged at. The method's
-constants were chosen on the first of them; those held out were drawn by seeds of their own once the constants stood.
+constants were chosen on the first of them; those held out were drawn by seeds of their own once the constants stood. Last the cameras' roles are swapped: the
+right camera's scan has other cells, gaps and highlights, and the left picture judges.
 """
 
 from __future__ import annotations
@@ -58,12 +59,18 @@ def along(points: FloatArray, centre_mm: FloatArray, angle: float) -> FloatArray
     return np.asarray(math.cos(angle) * from_centre[..., 0] + math.sin(angle) * from_centre[..., 1])
 
 
-def alexander_scan(capture: Capture) -> RangeScan:
-    """The decoded scan, its picture linear in light."""
+def alexander_pair(capture: Capture, *, swapped: bool = False) -> tuple[RangeScan, FloatArray, View]:
+    """The decoded scan on the left camera's grid with its picture, the right camera's picture, both linear in light, and that camera; or, `swapped`, the right
+    camera's scan with the left picture."""
     assert capture.right is not None and capture.right_view is not None
-    scan = decode_gray_code(capture.left, capture.left_view, capture.right, capture.right_view, name="alexander").scan
+    first, second = (capture.left, capture.left_view), (capture.right, capture.right_view)
+    if swapped:
+        first, second = second, first
+    scan = decode_gray_code(*first, *second, name="swapped" if swapped else "alexander").scan
     assert scan.brightness is not None
-    return replace(scan, brightness=Sensor(bits=0, response="srgb").linearise(scan.brightness).astype(np.float32))
+    sensor = Sensor(bits=0, response="srgb")
+    linear = replace(scan, brightness=sensor.linearise(scan.brightness).astype(np.float32))
+    return linear, sensor.linearise(second[0].white / second[0].full_scale), second[1]
 
 
 def places_of(scan: RangeScan, found: Agreement, count: int, seed: int) -> FloatArray:
@@ -146,12 +153,30 @@ def _dents_named(
     )
 
 
+def _swapped(capture: Capture, quick: bool) -> tuple[list[str], list[dict[str, Any]]]:
+    """The same with the cameras' roles swapped: other cells, gaps and highlights, and another picture that judges."""
+    scan, left, view = alexander_pair(capture, swapped=True)
+    clean = second_view(scan, left, view, step=_STEP)
+    largest = np.nanmax(clean.dents.z, initial=0.0)
+    findings = [
+        f"roles of the cameras swapped: {len(clean.regions)} places named on the unaltered scan, the largest z of a dent is {largest:.2f} ({clean.dents.level:.2f} is "
+        f"named); {100 * clean.judged:.0f} % judged for steps, dents of {JUDGED_MM:g} mm on {_shares(clean.dents)} of it"
+    ]
+    rows: list[dict[str, Any]] = [{"planted": "nothing", "swapped": True, "named": [vars(r) for r in clean.regions]}]
+    points = scan_grid(scan, _STEP).points
+    for depth, radius in _DENTS[:1] if quick else _DENTS[:2]:
+        among = clean.dents.judges[RADII_MM.index(radius)]
+        sets = [drawn(points, among, 3 if quick else 6, seed) for seed in _HELD_OUT[: 1 if quick else 2]]
+        _, said, more = _dents_named(scan, left, view, points, sets, depth, radius)
+        findings.append(f"roles swapped, in {len(sets)} scans: {said}")
+        rows += [row | {"swapped": True} for row in more]
+    return findings, rows
+
+
 def alexander(quick: bool) -> tuple[list[Any], list[str], list[dict[str, Any]], dict[str, bytes]]:
     """The part `alexander` of the study `fit`."""
     capture = read_capture(real_data("alexander_bust"))
-    scan = alexander_scan(capture)
-    assert capture.right is not None and capture.right_view is not None
-    right, view = Sensor(bits=0, response="srgb").linearise(capture.right.white / capture.right.full_scale), capture.right_view
+    scan, right, view = alexander_pair(capture)
     fitted, residual, spreads = shading_explained(scan)
     light = fitted.problem.lights[0]
     towards = ", ".join(f"{v:.3f}" for v in light.direction)
@@ -204,6 +229,9 @@ def alexander(quick: bool) -> tuple[list[Any], list[str], list[dict[str, Any]], 
             f"registration steps of {step:g} mm: {named} of {len(places)} named on their line, {as_step} with a region classed as registration; {elsewhere} "
             f"places named elsewhere, in {len(places)} scans"
         )
+    told, more = _swapped(capture, quick)
+    findings += told
+    rows += more
     depths = [d for d, r in _DENTS if r == _DENTS[0][1]]
     of = [share for share, (_, r) in zip(shares, _DENTS) if r == _DENTS[0][1]]
     chart = LineChart(

@@ -161,7 +161,7 @@ def classes(quick: bool) -> tuple[list[Any], list[str], list[dict[str, Any]]]:
     right = [row[f"named {row['planted']}"] / count for row, count in zip(rows, judged)]
     at_all = [1.0 - row["named nothing"] / count for row, count in zip(rows, judged)]
     chart = LineChart(
-"classes", f"One thing planted in a glossy ball's scan or picture: named as what it is ({scenes} scenes each)", "what was planted",
+        "classes", f"One thing planted in a glossy ball's scan or picture: named as what it is ({scenes} scenes each)", "what was planted",
         "share of the scenes judged",
         [
             Line("named at all", list(range(len(rows))), at_all, True, dashed=True, colour=1),
