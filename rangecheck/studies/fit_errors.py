@@ -2,7 +2,7 @@
 
 Errors and stated deviations are told apart: an error is measured against the truth of each scene, and its standard deviation over scenes taken from their
 median (a normal law's is 1.48 times it), so that one stray scene does not make it; what is stated is the median over the same scenes. Both are shown where at
-least half of the scenes determine the number: elsewhere there is a gap.
+least half of the scenes determine the number within a factor of two: elsewhere there is a gap.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SHOWN = ("K_lm", "K_lobe", "sigma_um", "correlation_um")
 _WORDS = {"K_lm": "K_lm", "K_lobe": "K_lobe", "sigma_um": "sigma", "correlation_um": "T"}
 _DEVIATION = "standard deviation, share of the true value"
 _NORMAL = 1.482602218505602
-_GAPS = "solid: errors against the truth; dashed: as the fit states; gaps: most scenes do not determine it"
+_GAPS = "solid: errors against the truth; dashed: as the fit states; gaps: most scenes do not determine it within a factor of two"
 #: a lamp that is found ends within this of the truth, degrees
 _FOUND_DEG = 1.0
 

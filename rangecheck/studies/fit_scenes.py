@@ -61,9 +61,11 @@ def truths(found: Fitted, at_truth: Problem) -> dict[str, float]:
 
 
 def stated_deviation(found: Fitted, name: str) -> float:
-    """Standard deviation of a number as the fit states it, parts of its value; nan where it is not determined."""
+    """Standard deviation of a number as the fit states it, parts of its value; nan where it is not determined within a factor of two.
+
+    An interval over several answers that explain the pictures alike holds the truth, but is no standard deviation around one of them."""
     e = found.estimate(name)
-    if e.low is None or e.high is None or not e.value > 0.0:
+    if e.low is None or e.high is None or not 0.0 < e.high <= 2.0 * e.low:
         return math.nan
     return (e.high - e.low) / (2.0 * TWO_SIDED_95 * e.value)
 
