@@ -3,7 +3,9 @@
 The unknowns are q = ln range of the valid cells of a grid. Brightness is held against the shading of the slopes of cells and of those halfway between two
 linked cells: a cell's own slopes, being means over two links, say nothing of heights that alternate. Bends hide from a cell what happens within it: of
 standard deviation s a cell they make slopes that walk at random, and the mean of such a slope over a pixel, which the picture has, and that over the two cells
-of a central difference are s / sqrt(24) apart, as are those over a link and over its two pixels.
+of a central difference are s / sqrt(24) apart, as are those over a link and over its two pixels. A bend of many standard deviations is a kink, and weighs as
+little as it is likely: strands of hair and creases then keep their edges, and what lies beside them stays as smooth as it is (Black and Rangarajan, *On the
+unification of line processes, outlier rejection, and robust statistics*, 1996).
 """
 
 from __future__ import annotations
@@ -21,7 +23,9 @@ from rangecheck.recover.heights import HeightGrid, Slopes
 from rangecheck.recover.shading import Shading
 
 #: bends of a surface, as 1/mm of curvature: the tightest prior tried, and the factor by which it is loosened where it takes too much away
-_CURVATURE, _LOOSER, _RUNGS = 1.0 / 60.0, 3.0, 9
+_CURVATURE, _LOOSER, _RUNGS = 1.0 / 60.0, 2.0, 14
+#: standard deviations of a bend from which it is more of a kink than of a bend (Cauchy's weights), and solutions of each rung that find its kinks
+_KINK, _KINK_TURNS = 2.0, 2
 #: cells over which what is taken away is averaged, and how many of its standard deviations are still noise
 _WINDOW, _NOISE_SIGMAS = 1.5, 3.0
 #: mean square of it, in variances, up to which bends that alternate are still noise: with 28 cells to a window, three deviations above 1
@@ -32,6 +36,8 @@ _STEPS, _BEND = 5, 2.0
 _MISSED, _RIM = 1.0 / np.sqrt(24.0 * _LOOSER), 4.0
 #: cells over which heights are held against the range again (113 to a window), and random signs that tell the influence of a cell on itself
 _TRUST_WINDOW, _PROBES = 3.0, 2
+#: times the expected square of what is taken away that chance explains (its deviation is 1.13 in such a window), and the power of its excess over that
+_CHANCE, _DISTRUST = 1.15, 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,23 +68,29 @@ class Balance:
         there.curvature = self.curvature
         return there
 
-    def _prior(self) -> sparse.csr_array:
-        weight = 1.0 / (self.curvature[self.heights.bend_cell] * self.bend_unit)
-        rows = sparse.diags_array(weight) @ self.heights.bend
-        return sparse.csr_array(self._data + rows.T @ rows)
+    def _prior(self, q: FloatArray | None = None, *, second: bool = False) -> sparse.csr_array:
+        """Of ranges and bends, the bends weighed as those of heights `q` are likely; or, where they are not negative, their second derivatives at `q`."""
+        bend = self.heights.bend
+        weight = (self.curvature[self.heights.bend_cell] * self.bend_unit) ** -2.0
+        if q is not None:
+            z = ((bend @ q) / _KINK) ** 2 * weight
+            weight = weight * (np.maximum(1.0 - z, 0.0) / (1.0 + z) ** 2 if second else 1.0 / (1.0 + z))
+        return sparse.csr_array(self._data + bend.T @ (sparse.diags_array(weight) @ bend))
 
     def settle(self) -> FloatArray:
         """Heights of least range and bends, the bends loosened where they take away more than noise."""
-        q = self.measured
+        q, right = self.measured, self.measured / self.sigma**2
+        bent: FloatArray | None = None
         for _ in range(_RUNGS):
-            self.matrix = self._prior()
-            q = solve(self.matrix, self.measured / self.sigma**2, q, self.sigma)
+            for _ in range(_KINK_TURNS if bent is not None else 1):
+                q = bent = solve(self._prior(bent), right, q, self.sigma)
             strained = self.strained(q)
             if not strained.any():
                 break
             self.curvature = np.where(strained, self.curvature * _LOOSER, self.curvature)
-        self.matrix = self._prior_matrix = self._prior()
-        return solve(self.matrix, self.measured / self.sigma**2, q, self.sigma)
+        q = solve(self._prior(bent), right, q, self.sigma)
+        self.curved = self._prior(q, second=True)
+        return q
 
     def strained(self, q: FloatArray, sigmas: float = _NOISE_SIGMAS, most: float = _MOST_ENERGY) -> BoolArray:
         """(n,) cells around which what was taken away is no noise."""
@@ -112,23 +124,28 @@ class Balance:
                 continue
             deviation = np.sqrt((noise[look.ends] ** 2).mean(axis=1) + look.unseen**2)[keep]
             used.append((look.slopes.only(keep), look.shading.only(keep), deviation, look.share))
-        for _ in range(_STEPS):
-            self.matrix, right = self._prior_matrix, self.measured / self.sigma**2
+        def balance(q: FloatArray, second: bool = False) -> tuple[sparse.csr_array, FloatArray]:
+            matrix, right = self._prior(q, second=second), self.measured / self.sigma**2
             for slopes, shading, deviation, share in used:
                 normals, slope_u, slope_v = slopes.normals(q)
                 value, by_normal = shading.at(normals)
                 r = (value - shading.seen) / deviation
-                weight = share * np.minimum(1.0, _BEND / np.maximum(np.abs(r), 1e-9))
+                weight = share * (np.abs(r) < _BEND if second else np.minimum(1.0, _BEND / np.maximum(np.abs(r), 1e-9)))
                 a = ((by_normal * slope_u).sum(1) / deviation)[:, None]
                 b = ((by_normal * slope_v).sum(1) / deviation)[:, None]
                 rows = sparse.csr_array(slopes.by_u.multiply(a) + slopes.by_v.multiply(b))
-                self.matrix = sparse.csr_array(self.matrix + rows.T @ (sparse.diags_array(weight) @ rows))
+                matrix = sparse.csr_array(matrix + rows.T @ (sparse.diags_array(weight) @ rows))
                 right = right + rows.T @ (weight * (rows @ q - r))
-            moved = solve(self.matrix, right, q, self.sigma)
+            return matrix, right
+
+        for _ in range(_STEPS):
+            matrix, right = balance(q)
+            moved = solve(matrix, right, q, self.sigma)
             step = float(np.max(np.abs(moved - q) / self.sigma))
             q = moved
             if step < 0.02:
                 break
+        self.curved, _ = balance(q, second=True)
         return q
 
     def trusted(self, q: FloatArray, noise: FloatArray) -> FloatArray:
@@ -136,12 +153,13 @@ class Balance:
 
         With y measured, its variance 1, d the influence of a cell on itself and e the mean square of q - y, the mean square error of y + t (q - y) is expected to
         be 1 + t^2 e - 2 t (1 - d) whatever the surface (Stein, *Estimation of the mean of a multivariate normal distribution*, 1981): least at
-        t = (1 - d) / e. d comes of random signs (Ramani, Blu and Unser, *Monte-Carlo SURE*, 2008)."""
+        t = (1 - d) / e. d comes of random signs (Ramani, Blu and Unser, *Monte-Carlo SURE*, 2008). Where e is no larger than chance makes it all is
+        kept; where it is, t falls with the square of the excess: what is smoothed was itself chosen by the noise, so that d is too small there."""
         heights, rng = self.heights, np.random.default_rng(0)
         influence = np.zeros(len(q))
         for _ in range(_PROBES):
             sign = rng.choice([-1.0, 1.0], len(q))
-            answer = solve(self.matrix, sign / self.sigma, np.zeros(len(q)), self.sigma)
+            answer = solve(self.curved, sign / self.sigma, np.zeros(len(q)), self.sigma, 0.03)
             influence += sign * answer / (self.sigma * _PROBES)
         ones = heights.spread(np.ones(len(q)), 0.0)
 
@@ -149,5 +167,7 @@ class Balance:
             return np.asarray(masked_gauss(heights.spread(values, 0.0), ones, _TRUST_WINDOW).reshape(-1)[heights.cell])
 
         expected = mean(noise**2 * (1.0 - influence))
-        share = np.clip(expected / np.maximum(mean((q - self.measured) ** 2), 1e-300), 0.0, 1.0)
+        taken = mean((q - self.measured) ** 2)
+        likely = np.maximum(_CHANCE * expected, 0.0)
+        share = np.divide(likely, taken, out=np.ones(len(q)), where=taken > likely) ** _DISTRUST
         return np.asarray(self.measured + share * (q - self.measured))
