@@ -124,6 +124,7 @@ class Balance:
                 continue
             deviation = np.sqrt((noise[look.ends] ** 2).mean(axis=1) + look.unseen**2)[keep]
             used.append((look.slopes.only(keep), look.shading.only(keep), deviation, look.share))
+
         def balance(q: FloatArray, second: bool = False) -> tuple[sparse.csr_array, FloatArray]:
             matrix, right = self._prior(q, second=second), self.measured / self.sigma**2
             for slopes, shading, deviation, share in used:
