@@ -24,7 +24,12 @@ from .common import Point, common, settings_from
 @click.option(
     "--field", type=click.FloatRange(1, 170), help="The camera's horizontal field of view, degrees; else the scene's own, or 30."
 )
-@click.option("--lights", type=click.Path(), metavar="FILE", help="About where the lamps stand: x y z, one line a picture.")
+@click.option(
+    "--lights",
+    type=click.Path(),
+    metavar="FILE",
+    help="About where the lamps stand: x y z, one line a picture. studio: those of render, where a scene has none of its own.",
+)
 @click.option(
     "--calibrate",
     type=click.Choice(["chrome", "matt", "bust"]),
@@ -44,14 +49,14 @@ from .common import Point, common, settings_from
     "--irradiance",
     type=click.FloatRange(1e-9),
     help="Of the lamps, so that a white surface shows irradiance/pi; 3 if not said. Of a scene's own lamps: of the first, or --set picture.exposure=E as "
-    "rendered.",
+    "rendered, or --find exposure.",
 )
 @click.option(
     "--find",
     multiple=True,
     type=click.Choice(["pose", "exposure", "strength", "distance", "radius", "ambient"]),
     help="Also find these; may be given several times. pose: the camera's, near --camera, by turns of a degree or so and shifts of some per cent of the object's size; exposure: of each picture but "
-    "the first; strength: irradiance of each lamp but the first; distance, radius: of each lamp; ambient: light from all around.",
+    "the first, and of that too where a scene's parts of known material tell it; strength: irradiance of each lamp but the first; distance, radius: of each lamp; ambient: light from all around.",
 )
 @click.option(
     "--lamp-distance", type=click.FloatRange(0, min_open=True), metavar="MM", help="The lamps' distance; far away otherwise."

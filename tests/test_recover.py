@@ -42,14 +42,19 @@ def photographed(problem, seed, noise=0.01):
 
 
 @pytest.mark.parametrize("masking", ["none", "smith", "v-groove"])
-@pytest.mark.parametrize("nodes", [ONE_NODE, SEVEN_NODES], ids=["middle", "spread"])
-def test_every_derivative_of_radiance_is_that_of_finite_differences(masking, nodes):
+@pytest.mark.parametrize(
+    ("nodes", "index"),
+    [(ONE_NODE, (0.0, 0.0)), (SEVEN_NODES, (0.0, 0.0)), (SEVEN_NODES, (2.0, 3.7))],
+    ids=["middle", "spread", "spread, steel"],
+)
+def test_every_derivative_of_radiance_is_that_of_finite_differences(masking, nodes, index):
     lights = (
         Light(np.array([0.3, 0.5, 0.8]), 2.0, np.zeros(3), 200.0, 5.0),
         Light(np.array([-0.9, 0.2, 0.1]), 1.0, np.zeros(3), 1e4, 3.0),
     )
     sight = sphere_sight((20, 20), 17, (41, 41), 1.0)
-    problem = problem_on(sight, lights, Guess(0.4, 0.3, 0.5, 0.12, 2.5, masking=masking), EVERYTHING, nodes)
+    metal = Guess(0.4, 0.3, 0.5, 0.12, 2.5, masking=masking, n=index[0], k=index[1])
+    problem = problem_on(sight, lights, metal, EVERYTHING, nodes)
     parameters = problem.parameters()
     rng = np.random.default_rng(1)
     theta = problem.start() + 0.02 * rng.normal(size=len(parameters)) * [p.unit for p in parameters]
@@ -115,16 +120,21 @@ def test_one_camera_s_pose_moves_every_picture_as_its_own_pose_would():
         assert np.array_equal(two.predict(two.start(), k).slopes, one.predict(one.start(), 0).slopes)
 
 
-def test_what_is_predicted_is_what_the_tracer_renders():
+@pytest.mark.parametrize("metal", [False, True], ids=["perfect conductor", "steel"])
+def test_what_is_predicted_is_what_the_tracer_renders(metal):
     surface = bumpy_ball()
-    material = Material("satin", K_lm=0.3, K_sl=0.4, sigma_um=0.15, correlation_um=3.0, wavelengths_um=(0.555,), bounded=False)
+    steel = {"index_um": (0.5, 0.6), "n": (2.06, 2.06), "k": (3.7, 3.7)} if metal else {}
+    material = Material(
+        "satin", K_lm=0.3, K_sl=0.4, sigma_um=0.15, correlation_um=3.0, wavelengths_um=(0.555,), bounded=False, **steel
+    )
     light = Light(np.array([0.5, 0.6, 0.7]), 2.0, np.zeros(3), 400.0, 1.0)
     scene = Scene(surface, (material,), sources=(light.source(),), smooth=True)
     camera, pose = PinholeCamera.from_field_of_view(64, 64, 12.0), rigid.look_at((100, 80, 500.0), (0, 0, 0))
     tracer = Tracer(scene)
     picture = tracer.render(camera, pose, DIRECT).radiance[..., 0].reshape(-1)
     sight = see(scene, camera, pose, tracer.caster)
-    problem = problem_on(sight, (light,), Guess(0.3, 0.0, 0.4, 0.15, 3.0), Unknowns())
+    guess = Guess(0.3, 0.0, 0.4, 0.15, 3.0, n=2.06 * metal, k=3.7 * metal)
+    problem = problem_on(sight, (light,), guess, Unknowns())
     problem = replace(problem, photographs=(replace(problem.photographs[0], lit=lit_by(sight, (light,), tracer.caster)),))
     shown = problem.predict(problem.start(), 0, slopes=False).values
     c_i = (sight.normals * light.direction).sum(1)
@@ -171,6 +181,51 @@ def test_intervals_are_wide_enough_where_a_few_pixels_hold_the_highlight():
     inside = np.mean([e.low <= truth[e.name] <= e.high for e in found])
     # the fit follows such pixels: their residuals, taken as they are, made it two in three
     assert len(found) > 300 and abs(inside - 0.95) < 3 * np.sqrt(0.95 * 0.05 / len(found))
+
+
+def test_a_cast_shadow_is_not_taken_for_dark_paint():
+    sight = sphere_sight((40, 40), 36, (81, 81))
+    lights = (
+        Light(np.array([0.4, 0.3, 0.8]), 2.0, np.zeros(3), FAR_MM),
+        Light(np.array([-0.5, 0.1, 0.8]), 0.6, np.zeros(3), FAR_MM),
+    )
+    put = problem_on(sight, lights, Guess(0.4, 0.0, 0.2, 0.15, 2.0), Unknowns(direction=False))
+    lit = np.stack([sight.points[:, 0] < 0.2 * sight.points[:, 1], np.ones(len(sight), bool)], axis=1)
+    shaded = photographed(replace(put, photographs=(replace(put.photographs[0], lit=lit),)), seed=5)
+    found = fit(replace(shaded, material=Guess()))
+    blind = fit(replace(shaded, material=Guess(), photographs=(replace(shaded.photographs[0], lit=np.ones_like(lit)),)))
+    assert found.estimate("K_lm").low < 0.4 < found.estimate("K_lm").high and found.scale < 1.1
+    # and where nobody knows of the shadow, its pixels are outliers
+    assert blind.estimate("K_lm").low < 0.4 < blind.estimate("K_lm").high and blind.outliers > 0.4
+
+
+def test_on_a_flat_plate_under_a_far_lamp_paint_and_light_from_around_are_not_told_apart():
+    ball = sphere_sight((20, 20), 17, (41, 41), 1.0)
+    ahead = np.broadcast_to([0.0, 0.0, 1.0], (len(ball), 3))
+    plate = replace(ball, normals=ahead.copy(), facing=ahead.copy(), points=ball.points * [1.0, 1.0, 0.0])
+    light = Light(np.array([0.4, 0.3, 0.8]), 2.0, np.zeros(3), FAR_MM)
+    put = problem_on(plate, (light,), Guess(0.4, 0.0, 1e-4), Unknowns(("K_lm",), direction=False, ambient=True))
+    found = fit(photographed(put, seed=2))
+    assert found.estimate("K_lm").low is None and found.estimate("picture 0 ambient").low is None
+    [said] = found.statements
+    assert "K_lm" in said and "picture 0 ambient" in said and "apart" in said
+    # on a ball, which is dark where the lamp does not reach, they are
+    both = fit(photographed(replace(put, photographs=(replace(put.photographs[0], sight=ball),)), seed=2))
+    assert both.estimate("K_lm").low < 0.4 < both.estimate("K_lm").high and not both.statements
+
+
+def test_a_mirror_s_lamp_is_found_as_large_as_it_is_from_wherever_the_fit_begins():
+    sight = sphere_sight((60, 58), 50, (121, 121))
+    ahead = np.array([0.4, 0.3, 0.8])
+    light = Light(ahead, 0.05, np.zeros(3), FAR_MM, 4.0)
+    names = ("K_lm", "K_spike", "K_lobe", "sigma_um", "correlation_um")
+    put = problem_on(sight, (light,), Guess(0.4, 0.25, 1e-4, 0.02, 2.0), Unknowns(names, radius=True), SEVEN_NODES, noise=0.002)
+    seen = photographed(put, seed=0, noise=0.002)
+    for begun in (2.0, 5.0):
+        there = Light(ahead + [0.02, -0.01, 0.0], 0.05, np.zeros(3), FAR_MM, begun)
+        found = fit(replace(seen, lights=(there,), material=Guess()))
+        radius = found.estimate("light 0 radius")
+        assert radius.value == pytest.approx(4.0, abs=0.05)
 
 
 def test_in_the_rough_limit_only_the_ratio_of_height_and_length_is_said_to_be_known():

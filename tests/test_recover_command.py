@@ -194,38 +194,3 @@ def test_a_chrome_sphere_s_highlights_are_listed_as_lamps(tmp_path, capsys):
     found = np.array(json.loads(capsys.readouterr().out)["directions"])
     assert np.degrees(np.arccos((found * lamps).sum(1))).max() < 0.3
     assert np.loadtxt(tmp_path / "lamps.txt", skiprows=1) == pytest.approx(found, abs=1e-6)
-
-
-def test_a_scene_s_part_gets_its_own_material_under_the_scene_s_lamp_and_surroundings(tmp_path, capsys):
-    grey = "wavelengths_um = [0.555]\nsigma_um = 0.15\ncorrelation_um = 2.0\n"
-    (tmp_path / "satin.toml").write_text(f"{grey}K_lm = 0.4\nK_sl = 0.25\n")
-    (tmp_path / "matt.toml").write_text("wavelengths_um = [0.555]\nK_lm = 0.9\n")
-    scene = tmp_path / "scene.toml"
-    scene.write_text(
-        f"""
-        tolerance_mm = 0.02
-        camera = {{ width = 120, height = 90, field_of_view_deg = 16, eye_mm = [60, 160, 420], target_mm = [5, 22, 0] }}
-        source = [{{ at_mm = [-150, 300, 300], radius_mm = 15, radiance = 300 }}]
-        [[body]]
-        name = "ball"
-        shape = "sphere"
-        radius_mm = 30
-        at_mm = [-15, 30, 0]
-        material = "{tmp_path / "satin.toml"}"
-        [[body]]
-        name = "block"
-        shape = "box"
-        size_mm = [30, 40, 30]
-        at_mm = [35, 20, 10]
-        material = "{tmp_path / "matt.toml"}"
-        """
-    )
-    picture, exposure = str(tmp_path / "seen.png"), ["--set", "picture.exposure=0.5"]
-    assert exit_status(["render", str(scene), "-o", picture, *exposure, "-q"]) == 0
-    known = [picture, "--on", str(scene), "--response", "srgb", "--noise", "0.002", *exposure]
-    document, found = fitted(capsys, *known, "--part", "ball", "-o", str(tmp_path / "m.toml"))
-    assert document["converged"] and len(document["lights"]) == 1
-    for name, truth in (("K_lm", 0.4), ("K_lobe", 0.25), ("sigma_um", 0.15), ("correlation_um", 2.0)):
-        assert holds(found[name], truth, 2.0) and found[name]["high"] - found[name]["low"] < 0.1 * truth
-    assert exit_status(["fit", *known, "-o", str(tmp_path / "n.toml")]) == 2
-    assert "--part, of ball, block" in capsys.readouterr().err

@@ -16,7 +16,7 @@ from rangecheck.errors import InputError, SettingError
 from rangecheck.files import read_bytes, write_bytes
 from rangecheck.optics import PinholeCamera, Sensor
 from rangecheck.pipeline.calibrating import check_kind, on_bust, on_sphere, three, within_deg
-from rangecheck.pipeline.fitting_scene import faces_of, field_of, lamps_of, simulator
+from rangecheck.pipeline.fitting_scene import SceneSimulator, faces_of, field_of, lamps_of, own_material, scene_looked_at
 from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.subject import Subject, hashes, read_subject
 from rangecheck.progress import Reporter
@@ -26,7 +26,7 @@ from rangecheck.recover.lights import ONE_NODE, SEVEN_NODES, Light
 from rangecheck.recover.looks import CameraFound, Look, facing, fit_looking, photographs
 from rangecheck.recover.problem import Guess, Problem, Unknowns
 from rangecheck.recover.sight import Sight, sphere_sight
-from rangecheck.recover.thrown import fit_simulated
+from rangecheck.recover.simulated import exposed, fit_simulated
 from rangecheck.reflectance import Material
 from rangecheck.scene import Scene
 
@@ -36,6 +36,9 @@ _NEAR = 5.0
 #: of a camera and of lamps of which nothing is said
 _FIELD_DEG, _IRRADIANCE, _RADIUS_DEG = 30.0, 3.0, 0.25
 _UNITS = {"radius": " degrees", "distance": " mm", "sigma_um": " um", "correlation_um": " um"}
+_FREED = {"strength": "irradiance"}
+#: what `lights` may say instead of a file: as `render` lights what has no lamps
+STUDIO = "studio"
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm")
 
 
@@ -50,7 +53,8 @@ def fit(
     `camera_mm`; or, with neither, of a scan's brightness on its own surface, and where the two contradict each other.
     `calibrate` finds the lamps alone, on a chrome or matt sphere, or on the `model` itself (bust). `find`: what else is unknown, of pose, exposure, strength, distance, radius,
     ambient; `lamp_distance_mm` and `lamp_radius_deg` are where the lamps' begin.
-    Of a modelled scene `part` is looked for; its camera and lamps are known from its file where neither `camera_mm` nor `lights` says otherwise."""
+    Of a modelled scene `part` is looked for; its camera and lamps are known from its file where neither `camera_mm` nor `lights` says otherwise; `lights`
+    studio: those in which `render` shows what has none of its own."""
     if sphere is None and model is None and len(pictures) == 1 and Path(pictures[0]).suffix.lower() not in _PICTURES:
         from rangecheck.pipeline.explained import fit_scan
 
@@ -60,7 +64,7 @@ def fit(
     if calibrate is not None:
         check_kind(calibrate, sphere, model, same_strength)
     with reporter.stage("reading pictures"):
-        values = [_linear(Path(p), response) for p in pictures]
+        values = [_linear(Path(p), response, green=calibrate is None) for p in pictures]
     if len({v.shape for v in values}) > 1:
         raise InputError(pictures[0], "has another size than the other pictures; give pictures of one size")
     if sphere is not None:
@@ -69,66 +73,96 @@ def fit(
         return on_sphere(pictures, values, sphere, calibrate, out, force, same_strength)
     if out is None and calibrate is None:
         raise SettingError("name the material file: -o FILE.toml", key="out")
-    given = None if lights is None else _directions(Path(lights), len(pictures))
+    given = None if lights in (None, STUDIO) else _directions(Path(str(lights)), len(pictures))
     shape = (values[0].shape[0], values[0].shape[1])
-    if "pose" in find and sphere is not None:
-        raise SettingError("a sphere's outline is its pose; --find pose is for --on MESH", key="find")
-    look: Look | None = None
-    subject: Subject | None = None
-    if part is not None and sphere is not None:
-        raise SettingError("a sphere has no parts; --part is for --on SCENE", key="part")
-    if sphere is not None:
-        sight = facing(sphere_sight(sphere[:2], sphere[2], shape))
-    else:
-        look, subject = _look(str(model), values, noise, camera_mm, field_deg, part, settings, unit, reporter)
-        sight = look.see()
-    middle, size = sight.points.mean(axis=0), max(float(np.ptp(sight.points, axis=0).max()), 1e-6)
-    distance = lamp_distance_mm or size * (_NEAR if "distance" in find else _FAR)
-    known = subject.model if subject is not None and subject.model is not None and subject.model.lamps and given is None else None
-    if known is not None and calibrate is not None:
-        raise SettingError(f"{model} says where its lamps are; give --lights to have them looked for from there", key="lights")
-    if known is not None and look is not None:
-        if lamp_distance_mm is not None or lamp_radius_deg is not None:
-            raise SettingError(f"{known.name} says where its lamps are; give --lights to place them otherwise", key="lights")
-        lamps = lamps_of(known, middle, settings.picture.exposure, irradiance)
-        look.together = True
-    else:
-        begun = given if given is not None else _first_directions(sight, values)
-        lamps = tuple(Light(d, irradiance or _IRRADIANCE, middle, distance, lamp_radius_deg or _RADIUS_DEG) for d in begun)
     names = (
         ("K_lm", "K_spike", "K_lobe", "sigma_um", "correlation_um") if spike else ("K_lm", "K_lobe", "sigma_um", "correlation_um")
     )
-    free = {"strength": "irradiance"}
     if calibrate is not None and not same_strength:
         find = tuple(dict.fromkeys((*find, "strength")))
-    unknowns = Unknowns(names, direction=known is None, one_camera=True, **{free.get(name, name): True for name in find})
+    free: dict[str, Any] = {_FREED.get(name, name): True for name in find}
+    if sphere is not None:
+        if "pose" in find:
+            raise SettingError("a sphere's outline is its pose; --find pose is for --on MESH", key="find")
+        if part is not None or lights == STUDIO:
+            raise SettingError("a sphere has no parts and no studio; --part and --lights studio are for --on SCENE", key="part")
+        sight = facing(sphere_sight(sphere[:2], sphere[2], shape))
+        look, known = None, None
+    else:
+        look, subject = _look(str(model), values, noise, camera_mm, field_deg, part, settings, unit, reporter)
+        lit = given is None and (lights == STUDIO or (subject.model is not None and bool(subject.model.lamps)))
+        known = scene_looked_at(subject, settings) if lit else None
+        if known is not None and calibrate is not None:
+            raise SettingError(
+                f"{model} says where its lamps are; give --lights to have them looked for from there", key="lights"
+            )
+        if known is not None and out is not None:
+            if lamp_distance_mm is not None or lamp_radius_deg is not None:
+                raise SettingError(
+                    f"{subject.name} says where its lamps are; give --lights to place them otherwise", key="lights"
+                )
+            return _in_a_scene(known, subject.name, look, names, free, settings, irradiance, out, pictures, force, reporter)
+        sight = look.see()
+    middle, size = sight.points.mean(axis=0), max(float(np.ptp(sight.points, axis=0).max()), 1e-6)
+    distance = lamp_distance_mm or size * (_NEAR if "distance" in find else _FAR)
+    begun = given if given is not None else _first_directions(sight, values)
+    lamps = tuple(Light(d, irradiance or _IRRADIANCE, middle, distance, lamp_radius_deg or _RADIUS_DEG) for d in begun)
+    taken = photographs(sight, values, lamps, noise, None if look is None else look.caster)
     nodes = SEVEN_NODES if "radius" in find else ONE_NODE
-    taken = photographs(sight, values, lamps, noise, None if look is None else look.caster, known is not None)
-    problem = Problem(taken, lamps, Guess(), unknowns, nodes)
+    problem = Problem(taken, lamps, Guess(), Unknowns(names, one_camera=True, **free), nodes)
     from rangecheck.recover.fit import fit as solve
 
     with reporter.stage("fitting"):
-        if look is None:
-            return _told(solve(problem, known_noise=False), out, pictures, force, reporter, None)
-        if known is not None and subject is not None:
-            fitted, found, rests = fit_simulated(problem, look, simulator(subject, look, lamps, settings))
-            fitted = replace(fitted, converged=fitted.converged and rests)
-            if settings.light.model != "direct":
-                reporter.note("the error of the light that was simulated is not in the intervals (light.model)")
-        else:
-            fitted, found = fit_looking(problem, look)
+        fitted, found = (solve(problem, known_noise=False), None) if look is None else fit_looking(problem, look)
     if calibrate is not None:
         return on_bust(fitted, pictures, out, force, reporter.seconds)
     return _told(fitted, out, pictures, force, reporter, found)
 
 
+def _in_a_scene(
+    scene: Scene, name: str, look: Look, names: tuple[str, ...], free: dict[str, Any], settings: Any, irradiance: float | None, out: str,
+    pictures: Sequence[str], force: bool, reporter: Reporter,
+) -> Outcome:  # fmt: skip
+    """The material of what `look` looks for in a scene whose lamps, surroundings and other parts are known."""
+    # of a picture in colour green is taken, the middle one
+    wave = scene.materials[0].wavelengths_um[scene.channels // 2]
+    exposure = settings.picture.exposure
+    unsaid = exposure is None and irradiance is None
+    if unsaid and "exposure" not in free:
+        raise SettingError(
+            f"{name} has lamps of its own; say how bright the pictures are: --set picture.exposure=E (as they were rendered, and as render writes beside "
+            "a picture), or --irradiance of the first lamp; or --find exposure, which parts of known material tell", key="irradiance",
+        )  # fmt: skip
+    own = own_material(scene, look.faces)
+    n, k = own.index_at(wave)
+    look.together = True
+    look.scene = replace(look.scene, smooth=scene.smooth, vertex_normals=scene.vertex_normals)
+    sight = look.see()
+    lamps = lamps_of(scene, name, sight.points.mean(axis=0), exposure, irradiance)
+    # a scene's lamps say how bright they are; only pictures may be exposed as nobody knows
+    unknowns = Unknowns(names, direction=False, one_camera=True, first_fixed=not unsaid, **free)
+    taken = photographs(sight, look.pictures, lamps, look.noise, look.caster, True)
+    problem = Problem(
+        taken, lamps, Guess(wavelength_um=wave, n=n or 0.0, k=k or 0.0), unknowns, SEVEN_NODES if "radius" in free else ONE_NODE
+    )
+    simulate = SceneSimulator(scene, look, lamps, settings, wave)
+    witnesses = look.faces is not None and any(free.get(what) for what in ("exposure", "ambient", "pose"))
+    with reporter.stage("fitting"):
+        if unsaid:
+            problem = exposed(problem, look, simulate, witnesses=witnesses)
+        fitted, found, rests = fit_simulated(problem, look, simulate, witnesses=witnesses)
+    metal = own if own.index_um else None
+    return _told(replace(fitted, converged=rests), out, pictures, force, reporter, found, metal)
+
+
 def _told(
-    fitted: Fitted, out: str | None, pictures: Sequence[str], force: bool, reporter: Reporter, camera: CameraFound | None
-) -> Outcome:
+    fitted: Fitted, out: str | None, pictures: Sequence[str], force: bool, reporter: Reporter, camera: CameraFound | None,
+    metal: Material | None = None,
+) -> Outcome:  # fmt: skip
     from rangecheck.recover.outcome import material_of, material_toml
 
     assert out is not None
-    material, assumed = material_of(fitted, Path(out).stem)
+    material, assumed = material_of(fitted, Path(out).stem, metal)
     names = ", ".join(Path(p).name for p in pictures)
     write_bytes(out, material_toml(material, fitted, f"fitted to {names}").encode(), force=force)
     lines = [f"{out}: residuals are {fitted.scale:.2f} times the noise, {100 * fitted.outliers:.1f} % of the pixels are outliers"]
@@ -181,11 +215,11 @@ def _within(fitted: Fitted, k: int) -> str:
     return ", not determined" if within is None else f", within {within:.2g} degrees (95 %)"
 
 
-def _linear(path: Path, response: str) -> FloatArray:
-    """A grey picture as parts of full scale, linear in light."""
+def _linear(path: Path, response: str, *, green: bool) -> FloatArray:
+    """A picture as parts of full scale, linear in light; of colours their luminance, or `green` alone, the light of one wavelength."""
     from rangecheck.scan.decode.capture import read_grey
 
-    raw = read_grey(path)
+    raw = read_grey(path, green=green)
     bits = 8 * raw.dtype.itemsize
     return np.asarray(Sensor(bits=bits, response=response).linearise(raw))
 

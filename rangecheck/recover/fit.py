@@ -13,16 +13,21 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from rangecheck.errors import SceneError
 from rangecheck.recover.intervals import profiled
 from rangecheck.recover.polish import TWO_SIDED_95, Estimate, Fitted, polish
-from rangecheck.recover.problem import Photograph, Problem
-from rangecheck.recover.starts import cheapest, families, solve, thin
+from rangecheck.recover.problem import LENGTHS, Photograph, Problem
+from rangecheck.recover.residuals import robust_cost
+from rangecheck.recover.starts import cheapest, families, lamps, mirrors, solve, thin
 
-__all__ = ["TWO_SIDED_95", "Estimate", "Fitted", "explored", "fit", "followed", "settled"]
+__all__ = ["TWO_SIDED_95", "Estimate", "Fitted", "elsewhere", "explored", "fit", "followed", "joined", "settled"]
 
 #: how much more (minus log likelihood) an end on a few pixels may cost to be tried on all, and one on all to count as good as the best
 _RIVAL, _AS_GOOD = 12.0, 1.9208
+#: starts under other lamps than those given
+_OTHER_LAMPS = 4
 #: pixels on which rivals are told apart before all are used
 _SEVERAL = 16000
 
@@ -53,7 +58,12 @@ def explored(
         raise SceneError(f"{count} pixels cannot determine {len(parameters)} numbers; give larger pictures or fewer unknowns")
     few = thin(problem, pixels)
     given = [few, *(replace(few, lights=s.lights, material=s.material) for s in starts or [])]
-    begun = [cheapest(family) for family in [given, *families(few)]]
+    every = [given, *families(few)]
+    begun = [cheapest(family) for family in every]
+    # and the most promising of the families' best under other lamps than those given
+    others = [cheapest(list(alike)) for family in every for alike in list(zip(*(lamps(state) for state in family)))[1:]]
+    for more in (others, mirrors(few)):
+        begun += sorted(more, key=lambda state: robust_cost(state, state.start()))[:_OTHER_LAMPS]
     found = sorted((solve(start, parameters) for start in begun), key=lambda pair: pair[1])
     near = _distinct([state for state, cost in found if cost < found[0][1] + _RIVAL], finalists)
     if count > 4 * _SEVERAL:
@@ -71,9 +81,13 @@ def followed(problem: Problem, states: Sequence[Problem]) -> list[Fitted]:
 
 def settled(problem: Problem, states: Sequence[Problem], *, known_noise: bool = True) -> Fitted:
     """The best end on all pixels from these states, with the intervals of all that explain the pictures as well."""
-    ended = [polish(_whole(problem, state), known_noise=known_noise) for state in _distinct(states, len(states))]
+    return joined([polish(_whole(problem, state), known_noise=known_noise) for state in _distinct(states, len(states))])
+
+
+def joined(ended: Sequence[Fitted]) -> Fitted:
+    """The best of some ends on the same pixels, with the intervals of all that explain the pictures as well."""
     best = min(ended, key=lambda f: f.cost)
-    others = [f for f in ended if f is not best and f.cost < best.cost + _AS_GOOD and _elsewhere(f, best)]
+    others = [f for f in ended if f is not best and f.cost < best.cost + _AS_GOOD and elsewhere(f, best)]
     known = profiled(best)
     if not others:
         return known
@@ -107,15 +121,36 @@ def _whole(problem: Problem, state: Problem) -> Problem:
     return replace(problem, lights=state.lights, material=state.material, photographs=_states_of(problem, state))
 
 
-def _elsewhere(one: Fitted, other: Fitted) -> bool:
-    """Whether two ends of fits are further apart than their intervals."""
-    a, b = one.problem.material, other.problem.material
-    return abs(math.log(a.sigma_um / b.sigma_um)) + abs(math.log(a.correlation_um / b.correlation_um)) > 0.2
+def elsewhere(one: Fitted, other: Fitted) -> bool:
+    """Whether two ends of fits are further apart than their intervals; numbers that neither knows, as lengths of a lobe too weak to be seen, are no
+    difference."""
+    open_ones = {e.name for e in one.estimates if e.low is None} & {e.name for e in other.estimates if e.low is None}
+    there, here = _sizes_of(one.problem), _sizes_of(other.problem)
+    if any(abs(there[name] - here[name]) > 0.1 for name in there if name not in open_ones):
+        return True
+    return set(LENGTHS) <= open_ones and any(_apart(a, b) for a, b in zip(one.estimates, other.estimates))
+
+
+def _sizes_of(state: Problem) -> dict[str, float]:
+    """Logarithms by which states count as different, by their parameters' names: of the lengths, and of the lamps' radii."""
+    sizes = {name: getattr(state.material, name) for name in LENGTHS}
+    sizes |= {f"light {k} radius": light.angular_radius_deg for k, light in enumerate(state.lights)}
+    return {name: math.log(size) for name, size in sizes.items()}
+
+
+def _apart(one: Estimate, other: Estimate) -> bool:
+    """Whether neither of two stated intervals holds the other's value."""
+    if one.low is None or one.high is None or other.low is None or other.high is None:
+        return False
+    return not (one.low <= other.value <= one.high or other.low <= one.value <= other.high)
 
 
 def _in_short(fitted: Fitted) -> str:
     m = fitted.problem.material
-    return f"sigma {m.sigma_um:.3g} um, T {m.correlation_um:.3g} um, K_lm {m.K_lm:.3g}, K_lobe {m.K_lobe:.3g}"
+    said = f"sigma {m.sigma_um:.3g} um, T {m.correlation_um:.3g} um, K_lm {m.K_lm:.3g}, K_lobe {m.K_lobe:.3g}"
+    if not fitted.problem.unknowns.radius:
+        return said
+    return f"{said}, lamps of {', '.join(f'{light.angular_radius_deg:.3g}' for light in fitted.problem.lights)} degrees"
 
 
 def _states_of(problem: Problem, state: Problem) -> tuple[Photograph, ...]:
@@ -126,11 +161,7 @@ def _states_of(problem: Problem, state: Problem) -> tuple[Photograph, ...]:
 
 def _distinct(begun: Sequence[Problem], count: int) -> list[Problem]:
     """The best starts, no two with nearly the same material and lights."""
-    chosen: list[Problem] = []
-    for p in begun:
-        key = (round(math.log(p.material.sigma_um), 1), round(math.log(p.material.correlation_um), 1))
-        if all(key != (round(math.log(c.material.sigma_um), 1), round(math.log(c.material.correlation_um), 1)) for c in chosen):
-            chosen.append(p)
-        if len(chosen) == count:
-            break
-    return chosen
+    chosen: dict[tuple[float, ...], Problem] = {}
+    for state in begun:
+        chosen.setdefault(tuple(np.round(list(_sizes_of(state).values()), 1)), state)
+    return list(chosen.values())[:count]

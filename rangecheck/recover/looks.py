@@ -17,19 +17,21 @@ import numpy as np
 
 from rangecheck import rigid
 from rangecheck.arrays import BoolArray, FloatArray
-from rangecheck.errors import SceneError
 from rangecheck.optics import PinholeCamera
 from rangecheck.raycast import EmbreeCaster
 from rangecheck.recover.fit import explored, followed, settled
 from rangecheck.recover.lights import Light
 from rangecheck.recover.polish import TWO_SIDED_95, Fitted, accumulate, polish
 from rangecheck.recover.problem import Photograph, Problem
+from rangecheck.recover.residuals import UNTOLD
 from rangecheck.recover.sight import Sight, lit_by, see
 from rangecheck.recover.starts import with_best_strengths
 from rangecheck.scene import Scene
 
 #: cosine below which a pixel is left out: grazing views, where the model's bound and the shape's own errors count
 _LEAST_COSINE = 0.3
+#: tilts of triangles against what they stand for: pixels so near a terminator tell nothing
+_TILTS = 2.0
 #: the most looks, and steps of each;  a pose that moved by less than this share of its standard deviations stands still
 _LOOKS, _STEPS, _STILL = 20, 3, 0.2
 #: pixels that a rough look has about
@@ -42,7 +44,7 @@ _SAME_SHADOWS = math.cos(math.radians(10.0))
 class Look:
     """A camera that looks at a surface, from a pose that a fit may move by turns about the middle of the surface, and shifts; and the pictures (h, w) that
     it took, linear, in parts of full scale, one lamp each or all lamps `together`, with their noise. Where not all of the surface is of the material looked
-    for, `faces` (m,) are: the others only cast their shadows."""
+    for, `faces` (m,) are: those of one part of a scene, of whose other light a simulator knows (`simulated`)."""
 
     scene: Scene
     caster: EmbreeCaster
@@ -60,8 +62,7 @@ class Look:
 
     def see(self, step: int = 1) -> Sight:
         """The pixels that see the surface at angles that can be trusted, of every `step`-th row and column."""
-        seen = see(self.scene, self.camera, self.pose, self.caster, step, self.pivot_mm)
-        return facing(seen if self.faces is None else _inside(seen, self.faces, step))
+        return facing(see(self.scene, self.camera, self.pose, self.caster, step, self.pivot_mm))
 
     def at(self, problem: Problem, state: Problem, step: int = 1) -> Problem:
         """The problem at a state, seen from the present pose under that state's lamps."""
@@ -71,12 +72,7 @@ class Look:
 
     def move(self, pose: FloatArray) -> None:
         """Move by small turns (rad) and shifts (mm), (6,)."""
-        turn, angle = pose[:3], float(np.linalg.norm(pose[:3]))
-        if angle > 0.0:
-            about = rigid.about_axis(turn / angle, angle)[:3, :3]
-            self.pose[:3, :3] = about @ self.pose[:3, :3]
-            self.pose[:3, 3] = self.pivot_mm + about @ (self.pose[:3, 3] - self.pivot_mm)
-        self.pose[:3, 3] += pose[3:]
+        self.pose = moved_by(self.pose, self.pivot_mm, pose)
 
 
 class CameraFound(NamedTuple):
@@ -87,21 +83,34 @@ class CameraFound(NamedTuple):
     turn_within_rad: float | None
 
 
+def moved_by(world_from_camera: FloatArray, pivot_mm: FloatArray, pose: FloatArray) -> FloatArray:
+    """(4, 4) a camera turned about the pivot, then shifted, by the six numbers of `pose` (rad, mm)."""
+    moved = world_from_camera.copy()
+    turn, angle = pose[:3], float(np.linalg.norm(pose[:3]))
+    if angle > 0.0:
+        about = rigid.about_axis(turn / angle, angle)[:3, :3]
+        moved[:3, :3] = about @ moved[:3, :3]
+        moved[:3, 3] = pivot_mm + about @ (moved[:3, 3] - pivot_mm)
+    moved[:3, 3] += pose[3:]
+    return moved
+
+
+def facing_of(sight: Sight) -> BoolArray:
+    """(n,) the pixels that see the surface steeply enough."""
+    return np.asarray((sight.normals * sight.views).sum(1) > _LEAST_COSINE)
+
+
 def facing(sight: Sight) -> Sight:
-    """The pixels that see the surface steeply enough."""
-    return sight.only((sight.normals * sight.views).sum(1) > _LEAST_COSINE)
+    """Only those pixels."""
+    return sight.only(facing_of(sight))
 
 
-def _inside(sight: Sight, faces: BoolArray, step: int) -> Sight:
-    """The pixels of these faces but for the outermost, which may see what is beside them too. Raises SceneError where none is left."""
+def inside_of(sight: Sight, chosen: BoolArray) -> BoolArray:
+    """(n,) the chosen pixels (n,) but for the outermost, which may see what is beside them too; of a sight of every row and column."""
     from scipy.ndimage import binary_erosion
 
-    mine = sight.spread(faces[sight.face].astype(float), 0.0) > 0.0
-    mine[::step, ::step] = binary_erosion(mine[::step, ::step], np.ones((3, 3)))
-    inside = sight.only(mine.reshape(-1)[sight.pixel])
-    if not len(inside):
-        raise SceneError("the camera sees nothing of the part that is looked for; name another, or check the camera")
-    return inside
+    inner = binary_erosion(sight.spread(chosen.astype(float), 0.0) > 0.0, np.ones((3, 3)))
+    return np.asarray(inner.reshape(-1)[sight.pixel])
 
 
 def photographs(
@@ -117,8 +126,21 @@ def photographs(
             if caster is None
             else lit_by(sight, tuple(lamps[n] for n in shining), caster)
         )
-        photos.append(Photograph(sight, seen, np.full(len(seen), noise), lit, shining))
+        unsure = UNTOLD * at_the_terminator(sight, [lamps[n] for n in shining])
+        photos.append(Photograph(sight, seen, np.hypot(noise, unsure), lit, shining))
     return tuple(photos)
+
+
+def at_the_terminator(sight: Sight, lamps: Sequence[Light]) -> BoolArray:
+    """(n,) the pixels where a lamp grazes the surface so closely that triangles and the rounded surface that they stand for disagree whether it is lit:
+    within some tilts of one against the other. On a finely made surface there are few."""
+    tilt = np.arccos(np.clip((sight.normals * sight.facing).sum(1), -1.0, 1.0))
+    margin = math.sin(min(_TILTS * float(np.quantile(tilt, 0.95)), 0.5))
+    grazed = np.zeros(len(sight), bool)
+    for lamp in lamps:
+        towards = lamp.centre_mm - sight.points
+        grazed |= np.abs((sight.normals * towards).sum(1)) < margin * np.linalg.norm(towards, axis=1)
+    return grazed
 
 
 def fit_looking(problem: Problem, look: Look) -> tuple[Fitted, CameraFound | None]:
@@ -140,7 +162,7 @@ def fit_looking(problem: Problem, look: Look) -> tuple[Fitted, CameraFound | Non
     problem = look.at(problem, state)
     fitted = settled(problem, [f.problem for f in followed(problem, [state, *states[1:]])], known_noise=False)
     _moved(look, fitted)
-    return fitted, _camera(fitted, look) if pose else None
+    return fitted, camera_found(fitted, look) if pose else None
 
 
 def _walked(problem: Problem, state: Problem, look: Look, step: int, *, roughly: bool = False) -> Problem:
@@ -163,16 +185,26 @@ def _widened(problem: Problem) -> Problem:
 
 def _moved(look: Look, fitted: Fitted) -> bool:
     """Move `look` by the pose that was found; whether that was little beside what is not known of it."""
-    at = [k for k, p in enumerate(fitted.parameters) if p.kind == "pose"]
-    if not at:
-        return True
-    found, spread = fitted.theta[at], np.sqrt(np.diag(fitted.determination.covariance)[at])
-    look.move(found)
-    return bool((np.abs(found) <= _STILL * spread).all())
+    at = _pose_of(fitted)
+    if at:
+        look.move(fitted.theta[at])
+    return stands_still(fitted)
 
 
-def _camera(fitted: Fitted, look: Look) -> CameraFound:
-    at = [k for k, p in enumerate(fitted.parameters) if p.kind == "pose"]
+def stands_still(fitted: Fitted) -> bool:
+    """Whether the pose that was found is little beside what is not known of it."""
+    at = _pose_of(fitted)
+    spread = np.sqrt(np.diag(fitted.determination.covariance)[at])
+    return bool((np.abs(fitted.theta[at]) <= _STILL * spread).all())
+
+
+def _pose_of(fitted: Fitted) -> list[int]:
+    return [k for k, p in enumerate(fitted.parameters) if p.kind == "pose"]
+
+
+def camera_found(fitted: Fitted, look: Look) -> CameraFound:
+    """Where the camera that `look` was moved to is, and how well that is known."""
+    at = _pose_of(fitted)
     spread = fitted.determination.covariance[np.ix_(at, at)]
     known = [fitted.estimates[k].low is not None for k in at]
     around = np.cross(np.eye(3), look.pose[:3, 3] - look.pivot_mm)

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
+
 from rangecheck.errors import SceneError
-from rangecheck.recover.fit import Estimate, Fitted
+from rangecheck.recover.fit import TWO_SIDED_95, Estimate, Fitted
 from rangecheck.reflectance import Material
 
 
-def material_of(fitted: Fitted, name: str = "fitted") -> tuple[Material, list[str]]:
-    """The material that was found, at its wavelength, and what had to be assumed; spike and lobe share the strength that both have (K_s).
+def material_of(fitted: Fitted, name: str = "fitted", metal: Material | None = None) -> tuple[Material, list[str]]:
+    """The material that was found, at its wavelength, and what had to be assumed; spike and lobe share the strength that both have (K_s). `metal`: whose
+    refractive index it was found with.
 
-    A strength that the pictures do not determine, as of a highlight that is saturated, is at most what the surface does not send elsewhere. Raises
-    SceneError where strengths that they do determine add to more than 1: then irradiance or exposure was not what it was taken to be."""
+    A strength that the pictures do not determine, as of a highlight that is saturated, is at most what the surface does not send elsewhere; and strengths
+    that add to more than 1 within their uncertainty add to 1. Raises SceneError where they add to more: then irradiance or exposure was not what it was
+    taken to be."""
     guess, said = fitted.problem.material, []
     open_ones = {e.name for e in fitted.estimates if e.low is None}
     for mirrored in ("K_spike", "K_lobe"):
@@ -23,6 +29,12 @@ def material_of(fitted: Fitted, name: str = "fitted") -> tuple[Material, list[st
             )
     both = min(guess.K_spike, guess.K_lobe)
     total = guess.K_lm + max(guess.K_spike, guess.K_lobe)
+    if 1.0 < total <= 1.0 + TWO_SIDED_95 * max(_spread_of_total(fitted), 1e-9):
+        said.append(
+            f"the strengths found add to {total:.4g}, within their uncertainty 1, the most that there is: they are made that"
+        )
+        guess = guess.but(**{name: getattr(guess, name) / total for name in ("K_lm", "K_spike", "K_lobe")})
+        both, total = both / total, 1.0
     if total > 1.0:
         raise SceneError(
             f"the strengths found add to {total:.3g}, and no surface reflects more than it receives: only their product with the light's "
@@ -31,9 +43,21 @@ def material_of(fitted: Fitted, name: str = "fitted") -> tuple[Material, list[st
         )
     material = Material(
         name, K_lm=guess.K_lm, K_ss=guess.K_spike - both, K_sl=guess.K_lobe - both, K_s=both, sigma_um=guess.sigma_um,
-        correlation_um=guess.correlation_um, wavelengths_um=(guess.wavelength_um,), masking=guess.masking,
+        correlation_um=guess.correlation_um, wavelengths_um=(guess.wavelength_um,), masking=guess.masking, **_index_of(metal),
     )  # fmt: skip
     return material, said
+
+
+def _spread_of_total(fitted: Fitted) -> float:
+    """Standard deviation of K_lm and the stronger of spike and lobe together."""
+    guess = fitted.problem.material
+    names = ["K_lm", "K_spike" if guess.K_spike > guess.K_lobe else "K_lobe"]
+    by = np.array([(p.name in names) * (guess.K_lobe if p.name == "K_lobe" else 1.0) for p in fitted.parameters])
+    return float(np.sqrt(by @ fitted.determination.covariance @ by))
+
+
+def _index_of(metal: Material | None) -> dict[str, Any]:
+    return {} if metal is None else {"index_um": metal.index_um, "n": metal.n, "k": metal.k}
 
 
 def material_toml(material: Material, fitted: Fitted, source: str) -> str:
@@ -47,6 +71,7 @@ def material_toml(material: Material, fitted: Fitted, source: str) -> str:
         f"wavelengths_um = [{material.wavelengths_um[0]:.9g}]",
         f"masking = {_text(material.masking)}",
         "",
+        *_index_table(material),
         "[uncertainty]",
         f"residual_in_noises = {fitted.scale:.4g}",
         f"not_determined = [{', '.join(_text(said) for said in fitted.statements)}]",
@@ -55,6 +80,13 @@ def material_toml(material: Material, fitted: Fitted, source: str) -> str:
         if not e.name.startswith(("light", "picture", "camera")):
             lines.append(f"{e.name} = {_interval(e)}")
     return "\n".join(lines) + "\n"
+
+
+def _index_table(material: Material) -> list[str]:
+    if not material.index_um:
+        return []
+    rows = {"wavelengths_um": material.index_um, "n": material.n, "k": material.k}
+    return ["[index]", *(f"{key} = [{', '.join(f'{v:.9g}' for v in values)}]" for key, values in rows.items()), ""]
 
 
 def _interval(e: Estimate) -> str:

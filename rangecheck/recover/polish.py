@@ -15,7 +15,7 @@ from rangecheck.arrays import BoolArray, FloatArray
 from rangecheck.errors import SceneError
 from rangecheck.recover.identify import Determination, determine
 from rangecheck.recover.problem import LEAST_LOBE, Parameter, Problem
-from rangecheck.recover.residuals import BEND, OUTLIER, moved_sights, residuals
+from rangecheck.recover.residuals import BEND, OUTLIER, UNTOLD, moved_sights, residuals
 
 #: standard deviations on either side of a 95 % interval
 TWO_SIDED_95 = 1.959963984540054
@@ -179,11 +179,13 @@ def accumulate(
         score += jacobian.T @ psi
         capped = np.minimum(size, OUTLIER)
         cost += float(np.where(linear, 0.5 * r * r, BEND * capped - 0.5 * BEND**2).sum())
-        outliers += int((~inside).sum())
-        count += len(r)
-        squares += float(((r * photo.noise)[inside] ** 2).sum())
-        sizes.append(size)
-    scale = float(np.median(np.concatenate(sizes)) / 0.6744897501960817)
+        # what tells nothing, as at a terminator, says nothing of how well the others are explained either
+        told = photo.noise < UNTOLD
+        outliers += int((~inside & told).sum())
+        count += int(told.sum())
+        squares += float(((r * photo.noise)[inside & told] ** 2).sum())
+        sizes.append(size[told])
+    scale = float(np.median(np.concatenate(sizes)) / 0.6744897501960817) if count else 0.0
     rms = math.sqrt(squares / max(1, count - outliers))
     return normal, score, meat, cost, (scale, rms, outliers / max(1, count))
 

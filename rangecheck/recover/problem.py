@@ -1,6 +1,7 @@
 """The inverse problem: photographs of one material under some lights, as residuals of numbered parameters, with their exact derivatives.
 
-    picture = exposure * sum over lights of radiance * value + ambient            values from `radiance.shade`, picture in parts of full scale
+    picture = exposure * (sum over lights of radiance * value + thrown) + ambient
+                                                    values from `radiance.shade`, thrown light from a simulator, picture in parts of full scale
 
 Parameters count from the problem's own state: K_lm, K_spike and ambient as they are, K_lobe, lengths, irradiance, distance, radius and exposure
 by their logarithms, a light's direction by two angles (rad), a camera's pose by its small turn (rad) and shift (mm).
@@ -21,6 +22,7 @@ from rangecheck.kernels import in_chunks
 from rangecheck.recover.lights import ONE_NODE, Light, light_arrays, tangents
 from rangecheck.recover.radiance import MATERIAL_NUMBERS, shade
 from rangecheck.recover.sight import POSE_NUMBERS, Sight
+from rangecheck.recover.thrown import Thrown
 from rangecheck.reflectance.lobe import MASKINGS, two_numbers
 
 STRENGTHS = ("K_lm", "K_spike", "K_lobe")
@@ -36,7 +38,8 @@ _ALL = -1
 
 @dataclass(frozen=True)
 class Guess:
-    """What a surface is taken to be made of: strengths of Lambert, spike and lobe, lengths in micrometres at one wavelength."""
+    """What a surface is taken to be made of: strengths of Lambert, spike and lobe, lengths in micrometres at one wavelength; of a metal that is known
+    its refractive index n + i k there (n = 0: a perfect conductor)."""
 
     K_lm: float = 0.5
     K_spike: float = 0.0
@@ -45,6 +48,12 @@ class Guess:
     correlation_um: float = 2.0
     wavelength_um: float = 0.555
     masking: str = "smith"
+    n: float = 0.0
+    k: float = 0.0
+
+    def numbers(self) -> tuple[float, ...]:
+        """As `Thrown` counts them: the strengths, and the logarithms of the lengths."""
+        return (self.K_lm, self.K_spike, self.K_lobe, math.log(self.sigma_um), math.log(self.correlation_um))
 
     def but(self, **numbers: float) -> Guess:
         """The same with some numbers changed."""
@@ -63,6 +72,7 @@ class Photograph:
     lights    their numbers in `Problem.lights`
     saturation  where the sensor stops counting
     exposure, ambient  what multiplies and what is added
+    thrown    what is beside the lights' straight light
     """
 
     sight: Sight
@@ -73,6 +83,7 @@ class Photograph:
     saturation: float = 1.0
     exposure: float = 1.0
     ambient: float = 0.0
+    thrown: Thrown | None = None
 
     def __post_init__(self) -> None:
         n = len(self.sight)
@@ -86,7 +97,9 @@ class Photograph:
 
     def only(self, keep: IntArray | BoolArray) -> Photograph:
         """The same picture, only these of its pixels."""
-        return replace(self, sight=self.sight.only(keep), values=self.values[keep], noise=self.noise[keep], lit=self.lit[keep])
+        thrown = None if self.thrown is None else self.thrown.only(keep)
+        few = {name: getattr(self, name)[keep] for name in ("values", "noise", "lit")}
+        return replace(self, sight=self.sight.only(keep), thrown=thrown, **few)
 
 
 @dataclass(frozen=True)
@@ -136,13 +149,15 @@ class Prediction(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Photographs, the lights they were taken under, the material as far as it is guessed, and what is unknown."""
+    """Photographs, the lights they were taken under, the material as far as it is guessed, and what is unknown. `reach`: how far lengths and strengths
+    may move (their logarithms), where thrown light is known near a state only."""
 
     photographs: tuple[Photograph, ...]
     lights: tuple[Light, ...]
     material: Guess
     unknowns: Unknowns = field(default_factory=Unknowns)
     nodes: FloatArray = field(default_factory=lambda: ONE_NODE)
+    reach: float = math.inf
 
     def parameters(self) -> list[Parameter]:
         """The unknowns in order, with their bounds relative to the state (absolute for strengths)."""
@@ -152,6 +167,7 @@ class Problem:
             if name == "K_lobe":
                 # by its logarithm: on smooth surfaces K_lobe sigma^2 acts, and what is free then is a straight line
                 least, most = (math.log(k / max(self.material.K_lobe, LEAST_LOBE)) for k in (LEAST_LOBE, 1e3))
+                least, most = max(least, -self.reach), min(most, self.reach)
                 found.append(Parameter(name, "log strength", 0, STRENGTHS.index(name), 1.0, least, most))
             elif name in STRENGTHS:
                 found.append(Parameter(name, "strength", 0, STRENGTHS.index(name), 1.0, 0.0, 1e3))
@@ -159,7 +175,8 @@ class Problem:
                 now = getattr(self.material, name)
                 low, high = (3e-3, 8.0) if name == "sigma_um" else (0.5, 1e3)
                 number = 3 + LENGTHS.index(name)
-                found.append(Parameter(name, "length", 0, number, 1.0, math.log(low * wave / now), math.log(high * wave / now)))
+                least, most = max(math.log(low * wave / now), -self.reach), min(math.log(high * wave / now), self.reach)
+                found.append(Parameter(name, "length", 0, number, 1.0, least, most))
         for k in range(len(self.lights)):
             if want.direction:
                 found += [
@@ -290,11 +307,12 @@ class _Shown:
         self.strengths = np.array([guess.K_lm, guess.K_spike, guess.K_lobe])
         seen = sight.moved(pose) if pose.any() else sight
         self.arguments = (
-            MASKINGS[guess.masking], self.strengths, roughness, reach, np.ascontiguousarray(seen.points), np.ascontiguousarray(seen.normals),
-            np.ascontiguousarray(seen.views), seen.footprints, photo.lit.astype(np.uint8), *light_arrays(tuple(self.lights)),
+            MASKINGS[guess.masking], self.strengths, roughness, reach, np.array([guess.n, guess.k]),
+            np.ascontiguousarray(seen.points), np.ascontiguousarray(seen.normals), np.ascontiguousarray(seen.views), seen.footprints, photo.lit.astype(np.uint8), *light_arrays(tuple(self.lights)),
             np.ascontiguousarray(state.nodes),
         )  # fmt: skip
         self.radiance = np.array([light.radiance for light in self.lights])
+        self.thrown = np.zeros(len(sight)) if photo.thrown is None else photo.thrown.near(guess.numbers(), pose)
 
     def _shade(self, start: int, stop: int) -> tuple[FloatArray, ...]:
         """value, by_material, by_centre, by_radius, by_point, by_normal, by_view, by_footprint of these pixels, source by source."""
@@ -307,7 +325,7 @@ class _Shown:
     def fill_by_normal(self, start: int, stop: int, values: FloatArray, slopes: FloatArray) -> None:
         value, *_, by_normal, _, _ = self._shade(start, stop)
         each = self.photo.exposure * self.radiance
-        values[start:stop] = value @ each + self.photo.ambient
+        values[start:stop] = value @ each + self.photo.exposure * self.thrown[start:stop] + self.photo.ambient
         slopes[start:stop] = np.einsum("msj,s->mj", by_normal, each)
 
     def _by_pose(self, start: int, stop: int, by: Sequence[FloatArray], by_footprint: FloatArray) -> FloatArray:
@@ -323,19 +341,21 @@ class _Shown:
         value, by_material, by_centre, by_radius, *turned, by_footprint = self._shade(start, stop)
         exposure, ambient = self.photo.exposure, self.photo.ambient
         each = exposure * self.radiance
-        light = value @ each
+        light = value @ each + exposure * self.thrown[start:stop]
         values[start:stop] = light + ambient
-        rows = jacobian[start:stop]
+        rows, thrown = jacobian[start:stop], self.photo.thrown
         by_pose = (
             self._by_pose(start, stop, [np.einsum("msj,s->mj", by, each) for by in turned], by_footprint @ each)
             if any(p.kind == "pose" for p in parameters)
             else None
         )
         for column, (p, move) in enumerate(zip(parameters, centre_slopes)):
-            if p.kind in ("strength", "length"):
+            if p.kind in ("strength", "length", "log strength"):
                 rows[:, column] = by_material[:, :, p.number] @ each
-            elif p.kind == "log strength":
-                rows[:, column] = self.strengths[p.number] * (by_material[:, :, p.number] @ each)
+                if thrown is not None:
+                    rows[:, column] += exposure * thrown.slopes[start:stop, p.number]
+                if p.kind == "log strength":
+                    rows[:, column] *= self.strengths[p.number]
             elif p.kind in ("exposure", "ambient", "pose"):
                 if p.owner not in (which, _ALL):
                     continue
@@ -345,6 +365,8 @@ class _Shown:
                     rows[:, column] = 1.0
                 elif by_pose is not None:
                     rows[:, column] = by_pose[:, p.number]
+                    if thrown is not None:
+                        rows[:, column] += exposure * thrown.by_pose[start:stop, p.number]
             elif p.owner in self.numbers:
                 k = self.numbers.index(p.owner)
                 light_k = self.lights[k]

@@ -1,12 +1,13 @@
 """Radiance that a point sends to the camera straight from spherical sources, with its exact derivatives.
 
-    L = K_lm F_form L_s  +  K_spike e^-g C L_s  +  K_lobe sum over the source of f_lobe cos L_s          (18)-(22), (34)
+    L = K_lm F_form L_s  +  K_spike F e^-g C L_s  +  K_lobe sum over the source of F f_lobe cos L_s      (18)-(22), (34)
 
 World frame, millimetres. F_form is the sphere's form factor, exact also where the horizon cuts it. C is the share of the pixel's mirrored
 footprint that the source fills: a disc of the footprint's solid angle against the source's disc, so that a highlight's energy does not
 depend on the pixel's size and C has a slope. The lobe is taken at nodes spread over the source; with one node, at its middle, as the
-tracer does without soft shadows. Facets are perfect conductors (F = 1: a strength recovered from pictures holds Fresnel's share) and
-the bound of `reflectance.energy` is left out: it scales the lobe by less than 1 % below 70 degrees, where pictures are compared.
+tracer does without soft shadows. Both mirror Fresnel's share F where the metal's n and k are known; else facets are perfect conductors
+(F = 1: a strength recovered from pictures then holds Fresnel's share). The bound of `reflectance.energy` is left out: it scales the
+lobe by less than 1 % below 70 degrees, where pictures are compared.
 
 All derivatives are by hand, source by source, for unit source radiance; visibility is held.
 """
@@ -19,6 +20,7 @@ import numpy as np
 
 from rangecheck.kernels import inline_kernel, kernel
 from rangecheck.recover.series_slopes import log_series_and_slopes
+from rangecheck.reflectance.fresnel import conductor_fresnel_slope
 from rangecheck.reflectance.lobe import SMITH, V_GROOVE
 
 #: the order of the derivatives with respect to the material; lengths enter by their logarithms
@@ -93,7 +95,7 @@ def _add(out, i, s, x, y, z):
 
 @kernel
 def _lobe_node(
-    i, s, masking, k_lobe, roughness, reach, rms_slope, n, v, c_r, qx, qy, qz, weight, radius,
+    i, s, masking, k_lobe, roughness, reach, rms_slope, index, n, v, c_r, qx, qy, qz, weight, radius,
     value, by_material, by_point, by_normal, by_view, towards,
 ):  # fmt: skip
     """Add what the node at offset q gives; `towards` (3,) gets the derivative by the node's place."""
@@ -135,6 +137,11 @@ def _lobe_node(
                 by_ci += 1.0 / c_i
             else:
                 by_cr += 1.0 / c_r
+    if index[0] > 0.0:
+        c_facet = 0.5 * math.sqrt(height2)
+        share, slope = conductor_fresnel_slope(min(c_facet, 1.0), index[0], index[1])
+        ln_f += math.log(share)
+        by_h2 += slope / share / (8.0 * c_facet)
     light = weight * math.pi * radius * radius / d2 * math.exp(ln_f)
     value[i, s] += k_lobe * light
     by_material[i, s, D_K_LOBE] += light
@@ -158,13 +165,13 @@ def _lobe_node(
 
 @kernel
 def shade(
-    masking, strengths, roughness, reach, points, normals, views, footprints, lit, centres, radii, frames, frame_slopes, nodes,
+    masking, strengths, roughness, reach, index, points, normals, views, footprints, lit, centres, radii, frames, frame_slopes, nodes,
     start, stop, value, by_material, by_centre, by_radius, by_point, by_normal, by_view, by_footprint,
 ):  # fmt: skip
     """Radiance of pixels start..stop from each source at unit radiance, and its derivatives, into arrays of their own rows.
 
     masking       number of lobe.MASKINGS
-    strengths     (3,) K_lm, K_spike, K_lobe;  roughness, reach  as in reflectance.lobe
+    strengths     (3,) K_lm, K_spike, K_lobe;  roughness, reach  as in reflectance.lobe;  index (2,) n, k; n = 0: a perfect conductor
     points, normals, views  (n, 3): place, unit normal, unit direction to the camera;  footprints (n,): angular radius of the disc as large
                   as the pixel's mirrored footprint, rad
     lit           (n, s) uint8, 0 where the source is hidden
@@ -216,12 +223,16 @@ def shade(
                 angle = math.asin(math.sqrt(sine2))
                 share, by_apart, by_angle, by_pixel = disc_share(apart, angle, footprints[row])
                 if share > 0.0:
-                    left = math.exp(-4.0 * roughness * c_r * c_r)
+                    left, by_c = math.exp(-4.0 * roughness * c_r * c_r), 0.0
+                    if index[0] > 0.0:
+                        reflected, by_c = conductor_fresnel_slope(c_r, index[0], index[1])
+                        by_c *= left
+                        left *= reflected
                     value[i, s] += k_spike * left * share
                     by_material[i, s, D_K_SPIKE] = left * share
                     strength = k_spike * left
                     by_material[i, s, D_LN_SIGMA] += -8.0 * roughness * c_r * c_r * strength * share
-                    fade = -8.0 * roughness * c_r * strength * share
+                    fade = (k_spike * by_c - 8.0 * roughness * c_r * strength) * share
                     turn = -strength * by_apart / max(sine, 1e-12)
                     grow = strength * by_angle * math.tan(angle) / d
                     gx = turn * (mx - cosine * wx) / d - grow * wx
@@ -242,7 +253,7 @@ def shade(
                 ay = nodes[q, 0] * frames[s, 0, 1] + nodes[q, 1] * frames[s, 1, 1]
                 az = nodes[q, 0] * frames[s, 0, 2] + nodes[q, 1] * frames[s, 1, 2]
                 light = _lobe_node(
-                    i, s, masking, k_lobe, roughness, reach, rms_slope, n, v, c_r, qx + r * ax, qy + r * ay, qz + r * az,
+                    i, s, masking, k_lobe, roughness, reach, rms_slope, index, n, v, c_r, qx + r * ax, qy + r * ay, qz + r * az,
                     nodes[q, 2], r, value, by_material, by_point, by_normal, by_view, towards,
                 )  # fmt: skip
                 if light == 0.0:

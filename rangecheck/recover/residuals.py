@@ -15,6 +15,8 @@ from rangecheck.recover.problem import Problem
 
 #: Huber's bend and the limit beyond which a pixel counts as an outlier, in standard deviations of its noise
 BEND, OUTLIER = 2.5, 6.0
+#: noise, parts of full scale, of a pixel that tells nothing
+UNTOLD = 1.0
 
 
 def residuals(problem: Problem, theta: FloatArray, which: int, *, slopes: bool = True) -> tuple[FloatArray, FloatArray]:

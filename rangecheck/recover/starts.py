@@ -8,11 +8,14 @@ from dataclasses import replace
 import numpy as np
 
 from rangecheck.arrays import FloatArray, IntArray
-from rangecheck.recover.problem import LEAST_LOBE, LENGTHS, STRENGTHS, Parameter, Photograph, Problem
+from rangecheck.recover.lights import Light
+from rangecheck.recover.problem import LEAST_LOBE, LENGTHS, STRENGTHS, WIDEST_DEG, Parameter, Photograph, Problem
 from rangecheck.recover.residuals import BEND, moved_sights, residuals, robust_cost
 
 #: starts: widths of the lobes (rms slope of the rough limit) and roughness (2 pi sigma/lambda)^2
 _START_WIDTHS, _START_ROUGHNESS = (0.03, 0.08, 0.2, 0.5), (0.03, 0.6, 10.0)
+#: and the lamps' radii, by that given: a highlight is as wide as its lamp and its lobe together, and many pairs look alike from afar
+_START_RADII = (0.3, 0.6, 1.7, 3.0)
 
 
 def thin(problem: Problem, pixels: int) -> Problem:
@@ -81,6 +84,52 @@ def families(problem: Problem) -> list[list[Problem]]:
     return families
 
 
+def mirrors(problem: Problem) -> list[Problem]:
+    """Starts as mirrors without a lobe, where a spike is looked for: beside a lobe, which is fitted to the highlight too, it would begin with nothing."""
+    wanted = problem.unknowns.material
+    if not {"K_spike", "sigma_um"} <= set(wanted):
+        return []
+    polished = problem.material.but(
+        K_lobe=LEAST_LOBE, sigma_um=math.sqrt(_START_ROUGHNESS[0]) * problem.material.wavelength_um / (2.0 * math.pi)
+    )
+    alone = replace(problem.unknowns, material=tuple(name for name in wanted if name != "K_lobe"))
+    states = [with_best_strengths(replace(lit, material=polished, unknowns=alone)) for lit in lamps(problem)]
+    return [replace(state, unknowns=problem.unknowns) for state in states]
+
+
+def lamps(problem: Problem) -> list[Problem]:
+    """The same state under other lamps, where they are unknown: where the brightest spots mirror them, and of other radii."""
+    places = [problem]
+    if problem.unknowns.direction and all(len(photo.lights) == 1 for photo in problem.photographs):
+        lights = list(problem.lights)
+        for photo in problem.photographs:
+            lights[photo.lights[0]] = _mirrored(photo, lights[photo.lights[0]])
+        places.append(replace(problem, lights=tuple(lights)))
+    return [sized for place in places for sized in (place, *(_radii(place) if problem.unknowns.radius else []))]
+
+
+def _mirrored(photo: Photograph, light: Light) -> Light:
+    """The lamp where the brightest spot of a picture mirrors it."""
+    sight = photo.sight
+    from scipy.ndimage import uniform_filter
+
+    members, total = (uniform_filter(sight.spread(v, 0.0), 3) for v in (np.ones(len(sight)), photo.values))
+    around = (total / np.maximum(members, 1e-9)).reshape(-1)[sight.pixel]
+    spot = around >= np.quantile(around, 1.0 - 4.0 / max(len(around), 5))
+    normal, view, point = (getattr(sight, name)[spot].mean(axis=0) for name in ("normals", "views", "points"))
+    normal, view = normal / np.linalg.norm(normal), view / np.linalg.norm(view)
+    along = 2.0 * (normal @ view) * normal - view
+    return replace(light, direction=point - light.middle_mm + light.distance_mm * along)
+
+
+def _radii(problem: Problem) -> list[Problem]:
+    return [
+        replace(problem, lights=tuple(
+            replace(light, angular_radius_deg=min(times * light.angular_radius_deg, WIDEST_DEG)) for light in problem.lights))
+        for times in _START_RADII
+    ]  # fmt: skip
+
+
 def cheapest(family: list[Problem]) -> Problem:
     """The best of some starts, each with its best strengths."""
     ready = [with_best_strengths(p) for p in family]
@@ -97,13 +146,15 @@ def with_best_strengths(problem: Problem) -> Problem:
     alone = replace(problem, unknowns=replace(problem.unknowns, material=STRENGTHS, direction=False, irradiance=False, distance=False,
                                               radius=False, exposure=False, ambient=False, pose=False))  # fmt: skip
     columns, rest = [], []
-    held = np.array([0.0 if name in names else getattr(problem.material, name) for name in STRENGTHS])
+    asked = [STRENGTHS.index(name) for name in names]
+    now = np.array([problem.material.K_lm, problem.material.K_spike, max(problem.material.K_lobe, LEAST_LOBE)])[asked]
     for k, photo in enumerate(problem.photographs):
-        slopes = alone.predict(alone.start(), k).slopes
+        shown, slopes = alone.predict(alone.start(), k)
         slopes[:, STRENGTHS.index("K_lobe")] /= max(problem.material.K_lobe, LEAST_LOBE)
         used = photo.values < photo.saturation
-        columns.append((slopes[:, [STRENGTHS.index(name) for name in names]] / photo.noise[:, None])[used])
-        rest.append(((photo.values - photo.ambient - slopes @ held) / photo.noise)[used])
+        mine = slopes[:, asked]
+        columns.append((mine / photo.noise[:, None])[used])
+        rest.append(((photo.values - shown + mine @ now) / photo.noise)[used])
     best, _ = nnls(np.concatenate(columns), np.concatenate(rest))
     return replace(problem, material=problem.material.but(**{n: max(float(b), LEAST_LOBE) for n, b in zip(names, best)}))
 

@@ -1,62 +1,42 @@
-"""Light that lamps do not send straight to a surface: of the surroundings, and what other parts throw and mirror. It depends on the material looked for.
-
-A fit knows lamps alone; a simulator knows all light, but not the material. They take turns: what the simulator shows of the material beyond the
-lamps' straight light is taken off the pictures, and the fit begins again, until it ends where it did:
-
-    picture - (simulated(material) - straight(material)) = straight(material)    =>    picture = simulated(material)
-"""
+"""Light that lamps do not send straight to the pixels' surface: of the surroundings, and what other parts throw and mirror. Only a simulator knows it,
+and only near a state: its values there, and how they change with what is looked for."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from rangecheck.arrays import FloatArray
-from rangecheck.recover.looks import CameraFound, Look, fit_looking, photographs
-from rangecheck.recover.polish import Fitted
-from rangecheck.recover.problem import Problem
+from rangecheck.arrays import BoolArray, FloatArray, IntArray
 
-#: the most turns, and the share of an interval's width by which a number may still move between the last two
-_TURNS, _STILL = 8, 0.1
+#: material numbers on which it depends: K_lm, K_spike, K_lobe, and the logarithms of sigma and T
+NUMBERS = 5
 
 
-def fit_simulated(
-    problem: Problem, look: Look, simulated: Callable[[Problem], FloatArray]
-) -> tuple[Fitted, CameraFound | None, bool]:
-    """As `fit_looking`, of pictures that hold thrown light too; and whether the turns came to rest. `simulated` gives the picture (h, w) of a state by all
-    lamps from where `look` is, in parts of full scale at exposure 1; NaN where nothing is seen."""
-    taken = look.pictures
-    fitted, camera = fit_looking(problem, look)
-    for _ in range(_TURNS):
-        thrown = _thrown(fitted, simulated(fitted.problem))
-        # what is saturated says only that it is at least full scale, whatever its light came by
-        look.pictures = [
-            np.where(picture < photo.saturation, picture - photo.exposure * thrown, picture)
-            for picture, photo in zip(taken, fitted.problem.photographs)
-        ]
-        before, lamps = fitted, problem.lights
-        seen = photographs(look.see(), look.pictures, lamps, look.noise, look.caster, look.together)
-        fitted, camera = fit_looking(replace(problem, photographs=seen), look)
-        if _still(before, fitted):
-            return fitted, camera, True
-    return fitted, camera, False
+@dataclass(frozen=True, eq=False)
+class Thrown:
+    """Radiance beside the lamps' straight light, at exposure 1.
 
+    at       (5,) the NUMBERS of the material that it was simulated with
+    values   (n,) of the pixels there;  slopes (n, 5) by the numbers
+    by_pose  (n, 6) by the camera's turn and shift, as `Sight.by_pose` counts them; zero where that was not simulated
+    """
 
-def _thrown(fitted: Fitted, all_light: FloatArray) -> FloatArray:
-    """(h, w) at exposure 1; 0 beside what is seen."""
-    state = fitted.problem
-    photo = state.photographs[0]
-    straight = (state.predict(state.start(), 0, slopes=False).values - photo.ambient) / photo.exposure
-    seen = all_light.reshape(-1)[photo.sight.pixel]
-    return photo.sight.spread(np.where(np.isnan(seen), 0.0, seen - straight), 0.0)
+    at: FloatArray
+    values: FloatArray
+    slopes: FloatArray
+    by_pose: FloatArray
 
+    @classmethod
+    def none(cls, n: int) -> Thrown:
+        """No such light on n pixels."""
+        return cls(np.zeros(NUMBERS), np.zeros(n), np.zeros((n, NUMBERS)), np.zeros((n, 6)))
 
-def _still(before: Fitted, after: Fitted) -> bool:
-    """Whether every number that both determine moved by little beside its interval."""
-    return all(
-        abs(a.value - b.value) <= _STILL * (b.high - b.low)
-        for a, b in zip(before.estimates, after.estimates)
-        if a.low is not None and b.low is not None and b.high is not None
-    )
+    def only(self, keep: IntArray | BoolArray) -> Thrown:
+        """Of these pixels."""
+        return Thrown(self.at, self.values[keep], self.slopes[keep], self.by_pose[keep])
+
+    def near(self, numbers: Sequence[float], pose: FloatArray) -> FloatArray:
+        """(n,) where the material has these NUMBERS and the camera is moved by `pose` (6,)."""
+        return np.asarray(self.values + self.slopes @ (np.asarray(numbers) - self.at) + self.by_pose @ pose)

@@ -76,8 +76,9 @@ def read_capture(folder: str | Path) -> Capture:
     raise InputError(folder, "holds neither capture.json nor leftCam and rightCam; describe the pictures in capture.json")
 
 
-def read_grey(path: Path) -> Picture:
-    """A grey picture (h, w) uint8 or uint16; colours become their luminance (ITU-R 601, as JPEG has it). Raises InputError."""
+def read_grey(path: Path, *, green: bool = False) -> Picture:
+    """A grey picture (h, w) uint8 or uint16; colours become their luminance (ITU-R 601, as JPEG has it), or their green alone, which is
+    of one wavelength's light whatever the numbers' response. Raises InputError."""
     import io
 
     from PIL import Image, UnidentifiedImageError
@@ -88,6 +89,8 @@ def read_grey(path: Path) -> Picture:
             warnings.simplefilter("ignore")
             picture = Image.open(io.BytesIO(content), formats=("JPEG", "PNG", "BMP", "PPM"))
             check_cells(path, *picture.size)
+            if green and picture.mode not in ("L", "I;16"):
+                return np.asarray(picture.convert("RGB").getchannel("G"))
             return np.asarray(picture if picture.mode in ("L", "I;16") else picture.convert("L"))
     except InputError:
         raise
