@@ -313,7 +313,6 @@ def test_a_job_says_in_its_surface_and_its_report_what_shading_refined(tmp_path,
 
 
 def test_a_refined_scan_is_taken_to_err_by_no_less_than_its_readings(clean):
-
     told = {}
     for name in (False, True):
         settings = load_settings(None, [f"scan.refine={str(name).lower()}"])
@@ -321,3 +320,4 @@ def test_a_refined_scan_is_taken_to_err_by_no_less_than_its_readings(clean):
         told[name] = ready.quality["views"][0]
     assert told[True]["noise_mm"] < 0.7 * told[False]["noise_mm"]  # what neighbours show of it
     assert told[True]["stated_noise_mm"] == pytest.approx(told[False]["noise_mm"], rel=0.15)
+    assert ready.grids[0].noise_mm == pytest.approx(told[False]["noise_mm"], rel=0.15)  # by which edges are cut and vertices err

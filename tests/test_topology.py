@@ -131,3 +131,15 @@ def test_edges_are_passed_both_ways_wherever_a_surface_has_no_rim_and_no_turned_
     turned = faces.copy()
     turned[4] = turned[4, ::-1]
     assert not every_edge_passed_both_ways(turned, 8)
+
+
+def test_noise_adds_wrinkles_to_an_area_and_little_to_it_without_them():
+    x, y = np.meshgrid(np.arange(40.0), np.arange(40.0))
+    cell = np.arange(39 * 40).reshape(39, 40)[:, :39].ravel()
+    faces = np.concatenate([np.stack([cell, cell + 1, cell + 41], 1), np.stack([cell, cell + 41, cell + 40], 1)]).astype(np.int32)
+    rough = np.random.default_rng(4).normal(0.0, 0.5, x.shape)
+    flat, noisy = (Surface(np.stack([x, y, z], axis=-1).reshape(-1, 3), faces) for z in (np.zeros_like(x), rough))
+    true = 39.0 * 39.0
+    assert flat.areas_without_wrinkles().sum() == pytest.approx(true)
+    assert noisy.area_mm2 > 1.2 * true
+    assert noisy.areas_without_wrinkles().sum() - true < 0.35 * (noisy.area_mm2 - true)

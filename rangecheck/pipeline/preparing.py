@@ -61,11 +61,11 @@ def prepared(
     grids, filtered = _filtered(grids, settings, reporter)
     done: list[Any] = []
     refining: list[dict[str, Any]] = []
-    noise_before: dict[str, float | None] = {}
     if settings.scan.refine:
         from rangecheck.pipeline.refining import refined_scans
 
-        noise_before = {scan.name: scan.noise_mm for scan in _with_noise(grids, Reporter())}
+        # what errs in refined ranges neighbours share, and no longer show: they are taken to err by no less than before
+        grids = _with_noise(grids, reporter)
         grids, done, refining = (shaped := refined_scans(grids, reporter)).scans, shaped.done, shaped.facts
     wanted = settings.scan.registration
     if clouds and wanted not in ("auto", "off"):
@@ -85,12 +85,10 @@ def prepared(
     worth = None
     if quality:
         known = None if report and report["left_out"] else samples
-        # what errs in refined ranges neighbours share, and no longer show: they are taken to err by no less than before
-        looked = [replace(scan, noise_mm=noise_before.get(scan.name, scan.noise_mm)) for scan in grids]
         if aside is None:
-            facts, lines = _worth(looked, known, settings, reporter)
+            facts, lines = _worth(grids, known, settings, reporter)
         else:
-            worth = aside.submit(_worth, looked, known, settings, Reporter())
+            worth = aside.submit(_worth, grids, known, settings, Reporter())
     return Prepared([*_with_noise(grids, reporter), *clouds], filtered, report, facts, lines, done, refining, worth)
 
 

@@ -132,6 +132,15 @@ class Surface:
         """Total area."""
         return float(self.face_areas.sum())
 
+    def areas_without_wrinkles(self) -> FloatArray:
+        """(m,) mm^2 of the faces as seen along the normals around each: noise, which turns every face another way, adds to an area of a fold's
+        size what this leaves out."""
+        normals, areas = self.made_vertex_normals(), np.empty(len(self.faces))
+        for piece in self.pieces():
+            around = unit_vectors(normals[self.faces[piece]].sum(axis=1))
+            areas[piece] = np.maximum(np.nan_to_num(np.einsum("ij,ij->i", self.area_vectors_of(piece), around)), 0.0)
+        return areas
+
     @property
     def volume_mm3(self) -> float:
         """Signed volume enclosed by the faces (divergence theorem); meaningful for closed surfaces only."""

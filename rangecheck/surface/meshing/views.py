@@ -37,6 +37,8 @@ FEATHER_CELLS = 2.5
 GAP_CELLS = 2
 #: standard error, in cells, of where a ray points
 ASIDE_CELLS = 0.05
+#: share of the stated noise below which what neighbours show is not all of it: they share the rest, as in ranges that were smoothed or refined
+SHOWN = 0.5
 #: cells seen at a flatter angle than this carry no weight
 FLATTEST_COSINE = 0.1
 
@@ -72,7 +74,7 @@ class Views:
 
 @kernel
 def _records(
-    ranges, chosen, factors, left_out, origins, directions, rotation, edge, pitch, first, last, cells, clues, residual, lateral
+    ranges, chosen, factors, shared, left_out, origins, directions, rotation, edge, pitch, first, last, cells, clues, residual, lateral
 ):  # fmt: skip
     """Make the local fits in `cells` (h, w, FIELDS) the records of rows first..last; clues and residuals become distances along the normal."""
     height, width = edge.shape[0], edge.shape[1]
@@ -115,7 +117,7 @@ def _records(
             record[4] = rotation[0, 0] * nx + rotation[0, 1] * ny + rotation[0, 2] * nz
             record[5] = rotation[1, 0] * nx + rotation[1, 1] * ny + rotation[1, 2] * nz
             record[6] = rotation[2, 0] * nx + rotation[2, 1] * ny + rotation[2, 2] * nz
-            record[7], record[8] = cosine, (factors[chosen[row, col] & CODES - 1] * quiet * cosine) ** 2
+            record[7], record[8] = cosine, (shared * factors[chosen[row, col] & CODES - 1] * quiet * cosine) ** 2
             for k in range(CLUES):
                 clues[row, col, k] *= cosine * cosine
             if chosen[row, col] >= 0:
@@ -217,14 +219,20 @@ def _fill_cells(scan: RangeScan, seen: Projection, cells: FloatArray, told: _Tol
     clues[...] = fits.clues
     residual, lateral = (a[rows].reshape(height, width) for a in (told.residual, told.lateral_mm))
     rotation = np.ascontiguousarray(scan.world_from_scan[:3, :3])
-    left_out = 1.0 / (1.0 - middle_weights())
+    left_out, shared = 1.0 / (1.0 - middle_weights()), _shared(scan, fits.noise_mm)
     in_chunks(
         lambda i, j: _records(
-            seen.ranges, fits.chosen, fits.factors, left_out, seen.origins, seen.directions, rotation, edge, seen.pitch, i, j, mine, clues,
-            residual, lateral,
+            seen.ranges, fits.chosen, fits.factors, shared, left_out, seen.origins, seen.directions, rotation, edge, seen.pitch, i, j, mine,
+            clues, residual, lateral,
         ),
         height, 32,
     )  # fmt: skip
+
+
+def _shared(scan: RangeScan, shown_mm: FloatArray) -> float:
+    """The noise that fits are taken to err by, over what neighbours show of it: 1, but where they share most of what is stated."""
+    shown = float(np.median(shown_mm[scan.valid]))
+    return scan.noise_mm / shown if scan.noise_mm is not None and shown < SHOWN * scan.noise_mm else 1.0
 
 
 def _points_of(scan: RangeScan, seen: Projection) -> FloatArray:
