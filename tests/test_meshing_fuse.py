@@ -150,7 +150,9 @@ def test_noise_of_which_half_is_left_and_shared_by_neighbours_is_expected_where_
     smoothed = []
     for scan in scans_around(Sphere(50.0), sigma=0.0):
         noise = gaussian_filter(np.random.default_rng(len(smoothed)).normal(0.0, 1.0, scan.range_mm.shape), 2.0)
-        smoothed.append(RangeScan(scan.range_mm + np.float32(0.05 / noise.std()) * noise, CAMERA, scan.world_from_scan, noise_mm=0.1))
+        smoothed.append(
+            RangeScan(scan.range_mm + np.float32(0.05 / noise.std()) * noise, CAMERA, scan.world_from_scan, noise_mm=0.1)
+        )
     surface = fuse(smoothed)
     error = np.abs(np.linalg.norm(surface.vertices, axis=1) - 50.0)
     assert (error < 2 * surface.vertex_error_mm).mean() > 0.95

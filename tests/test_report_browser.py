@@ -11,7 +11,11 @@ import pytest
 from browser import Page, browser, chromium
 from report_cases import job_of_a_vase
 
+from rangecheck.maps import trace_maps
+from rangecheck.optics import PinholeCamera
 from rangecheck.report import ReportContent, Turntable, write_report
+from rangecheck.rigid import look_at
+from rangecheck.surface.mesh_files import read_mesh
 
 pytestmark = pytest.mark.skipif(chromium() is None, reason="Chromium is not installed: apt-get install chromium")
 READY = "!data.model || document.getElementById('view').dataset.ready"
@@ -188,6 +192,52 @@ def test_focal_points_are_changed_by_the_keys(page):
     page.run("document.querySelector('input[name=focal]').focus()")
     page.press("ArrowRight")
     page.until("document.getElementById('map').dataset.map === '1'")
+
+
+def test_from_a_focal_point_of_the_readers_choice_the_page_measures_what_a_distance_map_holds(page, job):
+    surface = read_mesh(job / "surface.ply", "mm")
+    middle = surface.bounds_mm.mean(axis=0)
+    page.until("!document.getElementById('anywhere').hidden")
+    width, height, intrinsics = page.run("(({ width, height, intrinsics }) => [width, height, intrinsics])(data.maps[0])")
+    camera = PinholeCamera(width, height, *intrinsics)
+    page.run("document.getElementById('map').focus()")
+    page.press("ArrowLeft")
+    for azimuth, elevation, distance in ((33.0, 21.5, 300.0), (-120.0, -80.0, 260.0), (200.0, 7.0, 900.0)):
+        chosen = {"azimuth": azimuth, "elevation": elevation, "distance": distance}
+        page.run(
+            f"for (const [name, x] of Object.entries({json.dumps(chosen)})) document.getElementById(`focal-${{name}}`).value = x; 0"
+        )
+        page.run("document.getElementById('focal-azimuth').dispatchEvent(new Event('input'))")
+        assert page.run("document.getElementById('map').dataset.map") == "other"
+        a, e = np.radians((azimuth, elevation))
+        eye = middle + distance * np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
+        pose = look_at(eye, middle)
+        maps = trace_maps(surface, camera, pose)
+        true = maps.distance_mm
+        asked = f"offers.distances({json.dumps(pose.tolist())}, {json.dumps(intrinsics)}, {width}, {height}).values"
+        found = np.array(page.run(f"Array.from({asked}, (x) => (Number.isNaN(x) ? -1 : x))")).reshape(height, width)
+        seen = found >= 0
+        assert (seen != np.isfinite(true)).sum() <= 0.02 * seen.sum()  # a ray along a silhouette meets it or not by a rounding
+        both = seen & np.isfinite(true)
+        assert both.sum() > 50
+        # a vertex is kept to half a step, and an edge drawn to a 256th of a pixel: across the face that is as much, along a ray that grazes it more
+        off, step = np.abs(found - true)[both], page.run("data.model.step")
+        across = off * np.cos(maps.incidence_rad[both])
+        assert np.median(off) < step and np.quantile(across, 0.99) < step + distance / intrinsics[0] / 256
+        u, v = map(int, page.run("document.getElementById('map').dataset.pixel").split(","))
+        shown = page.run("document.getElementById('map-value').textContent")
+        assert shown == ("nothing" if found[v, u] < 0 else f"{found[v, u]:.2f} mm")
+
+
+def test_a_focal_point_inside_the_bust_or_out_of_bounds_is_said_to_be_so(page):
+    page.until("!document.getElementById('anywhere').hidden")
+    for distance, said in (("2", "inside the bust"), ("0", "1 to 100000"), ("", "1 to 100000"), ("300", "")):
+        page.run(f"document.getElementById('focal-distance').value = '{distance}'; 0")
+        page.run("document.getElementById('focal-distance').dispatchEvent(new Event('input'))")
+        assert said in page.run("document.getElementById('focal-status').textContent")
+    page.run("document.getElementById('focal-view').click()")
+    eye = json.loads(page.run("document.getElementById('view').dataset.pose"))
+    assert float(page.run("document.getElementById('focal-distance').value")) == pytest.approx(eye["distance"], abs=0.06)
 
 
 @pytest.mark.parametrize("width, scheme", [(1280, "light"), (400, "dark")])

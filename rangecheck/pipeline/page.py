@@ -350,7 +350,8 @@ def _model(kept: dict[str, Any]) -> Model:
             if key == "thickness_mm":  # what is far thicker than a wall is all alike
                 high = min(high, THICK * surface.extent_mm)
         fields.append(Field(key, label, "mm", values, low, max(high, low + 1e-6), _ABOUT[key] + says, colours))
-    return Model(surface, about, fields, kept["flagged"])
+    lighter = int(kept["faces_before"]) != len(surface.faces)
+    return Model(surface, about, fields, kept["flagged"], float(off_99) if lighter else 0.0)
 
 
 def _distance_maps(folder: Path) -> list[DistanceMap]:

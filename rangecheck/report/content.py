@@ -104,13 +104,14 @@ class Field:
 
 @dataclass(frozen=True)
 class Model:
-    """The bust for the 3-D view: a surface light enough to embed, `about` with how far it is from the real one, and what is known on its
-    vertices. `flagged` (n,) uint8 is 0, or 1 note, 2 warning, 3 error, where faces of a finding lie."""
+    """The bust for the 3-D view: a surface light enough to embed, `about` with how far it is from the real one, within `off_mm` for 99 % of its
+    points (0: it is that one), and what is known on its vertices. `flagged` (n,) uint8 is 0, or 1 note, 2 warning, 3 error, where faces of a finding lie."""
 
     surface: Surface
     about: str
     fields: Sequence[Field] = ()
     flagged: IntArray | None = None
+    off_mm: float = 0.0
 
     def __post_init__(self) -> None:
         count = len(self.surface.vertices)

@@ -1,4 +1,4 @@
-/* Distance maps: the value under the cursor, in millimetres, from any of the focal points. */
+/* Distance maps: the value under the cursor, in millimetres, from the focal points of the job or, computed here, from any other. */
 (() => {
   const canvas = byId("map");
   if (!canvas) return;
@@ -32,22 +32,25 @@
     const place = Number.isNaN(distance) ? null : placeOf(cursor[0], cursor[1], distance);
     where.textContent = `column ${cursor[0]}, row ${cursor[1]}${place ? `: ${point(place)}` : ""}`;
   };
-  const choose = async (index) => {
-    const next = data.maps[index];
-    next.values ||= await unpackedFloats(next.distance);
+  const show = (next, name, about) => {
     map = next;
     canvas.width = map.width; canvas.height = map.height;
     let low = Infinity, high = -Infinity;
-    for (const x of map.values) if (x < low) low = x; else if (x > high) high = x;
-    if (!(low <= high)) { low = Math.min(low, 0); high = low + 1; }
+    for (const x of map.values) { if (x < low) low = x; if (x > high) high = x; }
+    if (!(low <= high)) { low = 0; high = 1; }
     picture = context.createImageData(map.width, map.height);
     map.values.forEach((x, i) => { if (!Number.isNaN(x)) picture.data.set([...colourAt("viridis", 1 - (x - low) / (high - low || 1)), 255], 4 * i); });
     const eye = map.pose.slice(0, 3).map((row) => row[3]);
     byId("map-legend").replaceChildren();
-    drawScale(byId("map-legend"), "viridis", high, low, "mm", `Focal point at ${point(eye)}. ${map.width} × ${map.height} pixels, in steps of ${short(map.distance.step)} mm.`);
+    drawScale(byId("map-legend"), "viridis", high, low, "mm", `Focal point at ${point(eye)}. ${map.width} × ${map.height} pixels, ${about}.`);
     if (cursor) cursor = [Math.min(cursor[0], map.width - 1), Math.min(cursor[1], map.height - 1)];
-    canvas.dataset.map = String(index);
+    canvas.dataset.map = name;
     tellValue();
+  };
+  const choose = async (index) => {
+    const next = data.maps[index];
+    next.values ||= await unpackedFloats(next.distance);
+    show(next, String(index), `in steps of ${short(next.distance.step)} mm`);
   };
   canvas.addEventListener("pointermove", (e) => {
     if (!map) return;
@@ -71,6 +74,45 @@
     else return;
     e.preventDefault();
   });
-  for (const radio of document.querySelectorAll('input[name="focal"]')) radio.addEventListener("change", () => choose(Number(radio.value)));
+  const other = byId("focal-other");
+  for (const radio of document.querySelectorAll('input[name="focal"]')) radio.addEventListener("change", () => (radio === other ? measure() : choose(Number(radio.value))));
   choose(0);
+
+  // from anywhere: the focal point looks at the bust's middle, with the field of view of the job's maps
+  const like = data.maps.find((one) => one.intrinsics), anywhere = byId("anywhere");
+  if (!anywhere || !like) return;
+  const inputs = ["azimuth", "elevation", "distance"].map((name) => byId(`focal-${name}`)), status = byId("focal-status");
+  const middle = data.model.low.map((x, k) => (x + data.model.high[k]) / 2), radians = Math.PI / 180;
+  /** Pose at `eye` that looks at the middle: columns right, down, forward, eye. */
+  const poseAt = (eye) => {
+    const unit = (a) => a.map((x) => x / Math.hypot(...a)), cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+    const forward = unit(middle.map((x, k) => x - eye[k])), right = unit(cross(forward, [0, 1, 0])), down = cross(forward, right);
+    return [0, 1, 2].map((k) => [right[k], down[k], forward[k], eye[k]]).concat([[0, 0, 0, 1]]);
+  };
+  const measure = () => {
+    const [azimuth, elevation, distance] = inputs.map((input) => (input.value === "" ? NaN : Number(input.value)));
+    other.checked = true;
+    const wrong = inputs.find((input) => input.value === "" || !input.checkValidity());
+    if (wrong) { status.textContent = `${wrong.labels[0].textContent.trim()}: ${wrong.min} to ${wrong.max}.`; return; }
+    const a = (azimuth + data.front) * radians, e = elevation * radians;
+    const pose = poseAt([Math.sin(a) * Math.cos(e), Math.sin(e), Math.cos(a) * Math.cos(e)].map((x, k) => middle[k] + distance * x));
+    const { values, inside } = offers.distances(pose, like.intrinsics, like.width, like.height);
+    status.textContent = inside ? "The focal point lies inside the bust." : "";
+    show({ ...like, pose, values: inside ? values.fill(NaN) : values }, "other", data.model.exactness);
+  };
+  for (const input of inputs) input.addEventListener("input", measure);
+  byId("focal-view").addEventListener("click", () => {
+    const { azimuth, elevation, distance, target } = JSON.parse(byId("view").dataset.pose), a = azimuth * radians, e = elevation * radians;
+    const [x, y, z] = [Math.sin(a) * Math.cos(e), Math.sin(e), Math.cos(a) * Math.cos(e)].map((way, k) => target[k] + distance * way - middle[k]), away = Math.hypot(x, y, z);
+    const seen = [((Math.atan2(x, z) / radians - data.front + 540) % 360) - 180, Math.asin(y / away) / radians, away];
+    inputs.forEach((input, k) => { input.value = seen[k].toFixed(1); });
+    measure();
+  });
+  const offered = () => {
+    const eye = like.pose.slice(0, 3).map((row, k) => row[3] - middle[k]), away = Math.hypot(...eye);
+    inputs[1].value = ((Math.asin(eye[1] / away) / radians)).toFixed(1);
+    inputs[2].value = away.toFixed(0);
+    anywhere.hidden = other.parentElement.hidden = false;
+  };
+  if (offers.distances) offered(); else when("distances", offered);
 })();

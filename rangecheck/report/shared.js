@@ -11,6 +11,9 @@ const when = (name, listener) => { (told[name] ||= []).push(listener); };
 /** Tell all listeners of `name` but the one it comes from. */
 const tell = (name, value, from) => { for (const listener of told[name] || []) if (listener !== from) listener(value); };
 
+/** What one script can do for another, once it can. */
+const offers = {};
+
 /* on paper nothing can be opened: what is folded is printed unfolded */
 const folded = () => document.querySelectorAll("details:not([open])");
 let unfolded = [];

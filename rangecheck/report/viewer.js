@@ -208,6 +208,59 @@ async function startViewer() {
   canvas.addEventListener("pointermove", (e) => { if (!asked) requestAnimationFrame(read); asked = e; });
   canvas.addEventListener("pointerleave", () => { asked = null; reading.textContent = ""; });
 
+  // distances from any focal point, by its pose (x right, y down, z forward) and inner parameters: which face is seen through each pixel's middle is
+  // drawn, and where the ray meets its plane is reckoned, since what is drawn lies by shares of a pixel beside its place
+  let gauging = null;
+  const focal = new THREE.Camera();
+  focal.matrixAutoUpdate = focal.matrixWorldAutoUpdate = false;
+  const facesDrawn = () => {
+    const apart = new THREE.BufferGeometry(), places = new Float32Array(3 * model.faces.length);
+    model.faces.forEach((i, k) => { for (let j = 0; j < 3; j++) places[3 * k + j] = model.positions[3 * i + j]; });
+    apart.setAttribute("position", new THREE.BufferAttribute(places, 3));
+    apart.setAttribute("face", new THREE.BufferAttribute(Float32Array.from(model.faces, (_, k) => 1 + Math.floor(k / 3)), 1));
+    const drawn = new THREE.Mesh(apart, new THREE.ShaderMaterial({
+      side: THREE.DoubleSide, blending: THREE.NoBlending,
+      vertexShader: "attribute float face; varying highp float seen; void main() { seen = face; gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0); }",
+      fragmentShader: "varying highp float seen; void main() { gl_FragColor = vec4(seen, 0.0, 0.0, 1.0); }",
+    }));
+    drawn.frustumCulled = false;
+    return new THREE.Scene().add(drawn);
+  };
+  const distances = (pose, [fx, fy, cx, cy], width, height) => {
+    gauging ||= facesDrawn();
+    const eye = [0, 1, 2].map((k) => pose[k][3]), away = Math.hypot(...eye.map((x, k) => x - middle[k]));
+    const near = Math.max(away - 1.01 * radius, radius / 2000), far = away + 1.01 * radius;
+    focal.matrixWorld.set(...pose.flatMap(([x, y, z, at]) => [x, -y, -z, at]));
+    focal.matrixWorldInverse.copy(focal.matrixWorld).invert();
+    focal.projectionMatrix.set((2 * fx) / width, 0, 1 - (2 * cx + 1) / width, 0, 0, (2 * fy) / height, (2 * cy + 1) / height - 1, 0, 0, 0, -(far + near) / (far - near), (-2 * far * near) / (far - near), 0, 0, -1, 0);
+    focal.projectionMatrixInverse.copy(focal.projectionMatrix).invert();
+    const target = new THREE.WebGLRenderTarget(width, height, { type: THREE.FloatType, minFilter: THREE.NearestFilter, magFilter: THREE.NearestFilter });
+    const texels = new Float32Array(4 * width * height), values = new Float32Array(width * height).fill(NaN);
+    renderer.setRenderTarget(target);
+    renderer.render(gauging, focal);
+    renderer.readRenderTargetPixels(target, 0, 0, width, height, texels);
+    renderer.setRenderTarget(null);
+    target.dispose();
+    let hits = 0, fronts = 0;
+    const { positions, faces } = model;
+    for (let v = 0; v < height; v++)
+      for (let u = 0; u < width; u++) {
+        const face = Math.round(texels[4 * ((height - 1 - v) * width + u)]) - 1;
+        if (face < 0) continue;
+        const [a, b, c] = [0, 1, 2].map((k) => { const i = 3 * faces[3 * face + k]; return [positions[i] - eye[0], positions[i + 1] - eye[1], positions[i + 2] - eye[2]]; });
+        const p = b.map((x, k) => x - a[k]), q = c.map((x, k) => x - a[k]);
+        const normal = [p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]];
+        const seen = [(u - cx) / fx, (v - cy) / fy, 1], length = Math.hypot(...seen);
+        const steep = [0, 1, 2].reduce((sum, k) => sum + (normal[k] * (pose[k][0] * seen[0] + pose[k][1] * seen[1] + pose[k][2] * seen[2])) / length, 0);
+        // along a rim the plane may be met far beside its face
+        const ends = [a, b, c].map((corner) => Math.hypot(...corner)), at = (normal[0] * a[0] + normal[1] * a[1] + normal[2] * a[2]) / steep;
+        values[v * width + u] = Math.min(Math.max(...ends), Math.max(Math.min(...ends) - Math.hypot(...p) - Math.hypot(...q), at));
+        hits += 1;
+        fronts += steep < 0;
+      }
+    return { values, inside: closed && fronts < hits / 2 };
+  };
+
   const look = () => { for (const material of [inside, face]) material.color.set(getComputedStyle(document.documentElement).getPropertyValue("--cut").trim()); redraw(); };
   dark.addEventListener("change", look);
   new ResizeObserver(() => {
@@ -221,6 +274,7 @@ async function startViewer() {
   paint("plain");
   orbit.changed();
   canvas.dataset.ready = "yes";
+  if (renderer.extensions.has("EXT_color_buffer_float")) { offers.distances = distances; tell("distances"); }
 }
 
 if (data.model) {
