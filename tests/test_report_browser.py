@@ -2,6 +2,7 @@
 
 import base64
 import json
+import re
 from importlib import resources
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from browser import Page, browser, chromium
+from rangecheck_cli.main import exit_status
 from report_cases import job_of_a_vase
 
 from rangecheck.maps import trace_maps
@@ -151,6 +153,21 @@ def test_paper_shows_what_the_screen_folds(page):
     page.run("dispatchEvent(new Event('afterprint'))")
     assert page.run("document.querySelectorAll('details:not([open])').length") > 1
     assert len(page.call("Page.printToPDF")["data"]) > 10_000
+
+
+def test_the_report_is_printed_on_few_pages_and_nothing_else_is_changed(job, capsys):
+    before = (job / "report.html").read_bytes()
+    assert exit_status(["report", str(job), "--pdf", "-q"]) == 0
+    assert (job / "report.html").read_bytes() == before
+    pages = re.findall(rb"/Type\s*/Page\b", (job / "report.pdf").read_bytes())
+    assert 3 <= len(pages) <= 8
+
+
+def test_without_a_browser_printing_says_in_one_line_how_else(job, capsys, monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    assert exit_status(["report", str(job), "--pdf", "-q"]) == 2
+    said = capsys.readouterr().err
+    assert "apt-get install chromium" in said and len(said.splitlines()) == 1
 
 
 def test_the_value_under_the_cursor_is_the_measured_distance(page, job):

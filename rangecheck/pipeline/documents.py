@@ -312,7 +312,7 @@ def _documents() -> dict[str, tuple[Any, ...]]:
         "init": ("`init`", record(output=TEXT, json_schema=TEXT)),
         "schema": ("`schema`: the names that there are", record(names=by_name(TEXT))),
         "completion": ("`completion`", record(shell=TEXT, script=TEXT, put_it=TEXT)),
-        "report": ("`report`", record(output=TEXT, bytes=COUNT)),
+        "report": ("`report`", record(output=TEXT, bytes=COUNT, pdf=or_null(TEXT))),
         "settings": ("settings.json: every setting as it was resolved", _settings()),
         "scans": (
             "A manifest of depth pictures, or the companion of one",

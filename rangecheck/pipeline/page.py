@@ -139,8 +139,8 @@ def _read_arrays(path: Path) -> dict[str, Any] | None:
         raise InputError(path, f"cannot be read ({error}); run the job again with --force") from None
 
 
-def report(folder: str, *, studies: Sequence[str] = (), reporter: Reporter) -> Outcome:
-    """The report of the finished job in `folder`, made again; with `studies`, folders of studies whose charts it shows."""
+def report(folder: str, *, studies: Sequence[str] = (), pdf: bool = False, reporter: Reporter) -> Outcome:
+    """The report of the finished job in `folder`, made again; with `studies`, folders of studies whose charts it shows; with `pdf`, printed too."""
     where = Path(folder)
     if not (where / "run.json").is_file():
         raise InputError(where, "holds no finished job (no run.json); `rangecheck run` makes one")
@@ -153,10 +153,14 @@ def report(folder: str, *, studies: Sequence[str] = (), reporter: Reporter) -> O
             raise InputError(where / "run.json", f"is not what `rangecheck run` leaves ({told}); run the job again") from None
         write_report(page, where / "report.html")
     size = (where / "report.html").stat().st_size
-    return Outcome(
-        document("report", output=where / "report.html", bytes=size),
-        [f"{where / 'report.html'}: {size / 1e6:.1f} MB, no network"],
-    )
+    lines = [f"{where / 'report.html'}: {size / 1e6:.1f} MB, no network"]
+    if pdf:
+        from rangecheck.export.paper import write_pdf
+
+        with reporter.stage("printing"):
+            write_pdf(where / "report.html", where / "report.pdf")
+        lines.append(f"{where / 'report.pdf'}: the same on paper")
+    return Outcome(document("report", output=where / "report.html", bytes=size, pdf=where / "report.pdf" if pdf else None), lines)
 
 
 def page_of(folder: Path, content: dict[str, Any], studies: Sequence[str | Path] = ()) -> ReportContent:

@@ -94,6 +94,15 @@ REPORT = Settings(centre=True, shadow_rays=0, diffuse=False, depth=2, glints="co
 FULL = Settings(shadow_rays=1, depth=64, each=4)
 
 
+#: how much of the light each model follows, in words
+FOLLOWED = {
+    "direct": "light straight from the lamps, and what mirrors show of it (light.model direct)",
+    "plan": "as much of the light as the tolerance asks for (light.model plan)",
+    "full": "all of the light, between surfaces too (light.model full)",
+    "report": "light as in the report of 1991 (light.model report)",
+}
+
+
 @dataclass(frozen=True)
 class Plan:
     """What a picture will be computed with, and why.
@@ -116,4 +125,4 @@ class Plan:
     def explain(self) -> list[str]:
         """The decisions, one line each, for people."""
         promised = f", tolerance {100 * self.tolerance:g} % of the mean radiance" if self.tolerance else ""
-        return [f"model {self.model}{promised}", *self.reasons]
+        return [f"{FOLLOWED[self.model]}{promised}", *self.reasons]
