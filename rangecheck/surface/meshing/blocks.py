@@ -76,7 +76,8 @@ def grid_near(
     index = np.full(tuple(shape), MISSING, np.int32)
     _mark_near_samples(samples_mm, origin_mm, BLOCK * step_mm, reach_mm, index)
     index[also] = 0
-    place = np.argwhere(index == 0).astype(np.int32)
+    # one order in memory from the first: kernels that take it are compiled once
+    place = np.argwhere(index == 0).astype(np.int32, order="C")
     none = np.empty((0, CORNERS), np.float32)
     grid = Grid(origin_mm, step_mm, index, place[:0], np.empty((0, 27), np.int32), none, np.empty((0, CORNERS), np.uint8))
     return add_blocks(grid, place)
