@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from rangecheck_cli.main import exit_status
 
+from rangecheck import kernels
 from rangecheck.config import load_settings
 from rangecheck.errors import ScanError
 from rangecheck.files import read_json
 from rangecheck.optics import PinholeCamera
 from rangecheck.pipeline.preparing import prepared
-from rangecheck.pipeline.refining import share_refined
+from rangecheck.pipeline.refining import refined_scans, share_refined
 from rangecheck.progress import Reporter
 from rangecheck.recover.balance import Balance
 from rangecheck.recover.grid import scan_grid
@@ -293,6 +294,23 @@ def test_the_command_refines_only_when_asked(tmp_path, clean):
         assert exit_status(["mesh", str(tmp_path / "in"), "--method", "grid", "-o", str(tmp_path / name), "-q", *more]) == 0
     assert b"property uchar refined" not in (tmp_path / "raw.ply").read_bytes()[:1000]
     assert b"property uchar refined" in (tmp_path / "fine.ply").read_bytes()[:1000]
+
+
+def test_scans_refined_side_by_side_are_those_refined_one_after_another(clean):
+    scans = [
+        clean[0],
+        replace(clean[0], brightness=np.zeros_like(clean[0].brightness), name="unlit"),
+        replace(rippled(seed=1)[0], name="other"),
+    ]
+    told = []
+    for count in (1, 3):
+        with kernels.threads(count):
+            reporter = Reporter()
+            shaped = refined_scans(scans, reporter)
+        told.append(([scan.range_mm.tobytes() for scan in shaped.scans], shaped.facts, reporter.notes))
+    assert told[0] == told[1]
+    assert told[0][0][1] == scans[1].range_mm.tobytes() and "refused" in told[0][1][1]
+    assert [one.scan.name for one in shaped.done] == ["ball", "other"] and len(told[0][2]) == 3
 
 
 def test_a_job_says_in_its_surface_and_its_report_what_shading_refined(tmp_path, clean):

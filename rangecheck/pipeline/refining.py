@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from itertools import count
+from threading import Lock
 from typing import Any
 
 import numpy as np
 
+from rangecheck import kernels, memory
 from rangecheck.errors import ScanError
 from rangecheck.progress import Reporter
 from rangecheck.recover.refine import Refined, refine, refined_faces
@@ -24,33 +28,39 @@ class Shaped:
 
 
 def refined_scans(scans: list[RangeScan], reporter: Reporter) -> Shaped:
-    """Each scan with a brightness image refined by it; those that cannot be are kept, and it is said why."""
-    found, done, facts = [], [], []
+    """Each scan with a brightness image refined by it; those that cannot be are kept, and it is said why. Side by side, a core each, unless memory is
+    bounded."""
     with reporter.stage("refining by shading", len(scans)):
-        for number, scan in enumerate(scans, 1):
-            try:
-                better = refine(scan)
-            except ScanError as refusal:
-                found.append(scan)
-                facts.append({"name": scan.name, "refined": 0.0, "refused": str(refusal)})
-                reporter.note(f"not refined: {refusal}")
-            else:
-                found.append(better.scan)
-                done.append(better)
-                share = float(better.refined.sum() / scan.valid.sum())
-                moved = float(np.sqrt(np.nanmean(better.moved_mm**2)))
-                facts.append(
-                    {
-                        "name": scan.name,
-                        "refined": share,
-                        "moved_rms_mm": moved,
-                        "painted": float(better.painted.sum() / scan.valid.sum()),
-                    }
-                )
-                reporter.note(
-                    f"{scan.name}: {100 * share:.0f} % of the cells refined by their brightness, ranges moved by {moved:.3f} mm (rms)"
-                )
-            reporter.advance(number)
+        ended, telling = count(1), Lock()
+
+        def one(first: int, _: int) -> Refined | ScanError:
+            with kernels.alone():
+                try:
+                    return refine(scans[first])
+                except ScanError as refusal:
+                    return refusal
+                finally:
+                    with telling:
+                        reporter.advance(next(ended))
+
+        with kernels.threads(1) if memory.bounded() else nullcontext():
+            answers = kernels.in_chunks(one, len(scans), 1)
+    found, done, facts = [], [], []
+    for scan, answer in zip(scans, answers, strict=True):
+        if isinstance(answer, ScanError):
+            found.append(scan)
+            facts.append({"name": scan.name, "refined": 0.0, "refused": str(answer)})
+            reporter.note(f"not refined: {answer}")
+            continue
+        found.append(answer.scan)
+        done.append(answer)
+        share = float(answer.refined.sum() / scan.valid.sum())
+        moved = float(np.sqrt(np.nanmean(answer.moved_mm**2)))
+        painted = float(answer.painted.sum() / scan.valid.sum())
+        facts.append({"name": scan.name, "refined": share, "moved_rms_mm": moved, "painted": painted})
+        reporter.note(
+            f"{scan.name}: {100 * share:.0f} % of the cells refined by their brightness, ranges moved by {moved:.3f} mm (rms)"
+        )
     return Shaped(found, done, facts)
 
 
