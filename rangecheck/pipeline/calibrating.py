@@ -56,9 +56,7 @@ def on_sphere(
             f"residual {100 * found.rms:.2f} % of full scale"
         )
         if len(values) < PAINTED:
-            lines.append(
-                f"{len(values)} of pictures do not tell stains and uneven beams from the lamp's direction; {PAINTED} or more would"
-            )
+            lines.append(f"fewer than {PAINTED} pictures do not tell stains and uneven beams from the lamps' directions")
         else:
             worst = int(np.argmax(np.hypot(*found.uneven.T)))
             lines.append(

@@ -21,7 +21,7 @@ from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.subject import Subject, hashes, read_subject
 from rangecheck.progress import Reporter
 from rangecheck.raycast import EmbreeCaster
-from rangecheck.recover.fit import Fitted
+from rangecheck.recover.fit import Estimate, Fitted
 from rangecheck.recover.lights import ONE_NODE, SEVEN_NODES, Light
 from rangecheck.recover.looks import CameraFound, Look, facing, fit_looking, photographs
 from rangecheck.recover.problem import Guess, Problem, Unknowns
@@ -39,6 +39,8 @@ _UNITS = {"radius": " degrees", "distance": " mm", "sigma_um": " um", "correlati
 _FREED = {"strength": "irradiance"}
 #: what `lights` may say instead of a file: as `render` lights what has no lamps
 STUDIO = "studio"
+#: in units of its noise, what some pixel of a picture that is not dark shows;  pixels below saturation that a picture needs
+_LEAST_LIGHT, _LEAST_COUNTED = 5.0, 10
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm")
 
 
@@ -63,6 +65,10 @@ def fit(
         raise SettingError("name what the pictures show, one of --sphere COLUMN,ROW,RADIUS and --on MESH", key="sphere")
     if calibrate is not None:
         check_kind(calibrate, sphere, model, same_strength)
+    elif out is None:
+        raise SettingError("name the material file: -o FILE.toml", key="out")
+    elif Path(out).suffix.lower() != ".toml":
+        raise InputError(out, "would hold a material, and materials are read from .toml; name it so: -o FILE.toml")
     with reporter.stage("reading pictures"):
         values = [_linear(Path(p), response, green=calibrate is None) for p in pictures]
     if len({v.shape for v in values}) > 1:
@@ -71,8 +77,6 @@ def fit(
         _refuse_beside(sphere, values[0].shape[1], values[0].shape[0])
     if calibrate is not None and sphere is not None and calibrate != "bust":
         return on_sphere(pictures, values, sphere, calibrate, out, force, same_strength)
-    if out is None and calibrate is None:
-        raise SettingError("name the material file: -o FILE.toml", key="out")
     given = None if lights in (None, STUDIO) else _directions(Path(str(lights)), len(pictures))
     shape = (values[0].shape[0], values[0].shape[1])
     names = (
@@ -87,9 +91,12 @@ def fit(
         if part is not None or lights == STUDIO:
             raise SettingError("a sphere has no parts and no studio; --part and --lights studio are for --on SCENE", key="part")
         sight = facing(sphere_sight(sphere[:2], sphere[2], shape))
+        _refuse_unexposed(sight, pictures, values, noise)
         look, known = None, None
     else:
         look, subject = _look(str(model), values, noise, camera_mm, field_deg, part, settings, unit, reporter)
+        sight = look.see()
+        _refuse_unexposed(sight, pictures, values, noise)
         lit = given is None and (lights == STUDIO or (subject.model is not None and bool(subject.model.lamps)))
         known = scene_looked_at(subject, settings) if lit else None
         if known is not None and calibrate is not None:
@@ -102,7 +109,6 @@ def fit(
                     f"{subject.name} says where its lamps are; give --lights to place them otherwise", key="lights"
                 )
             return _in_a_scene(known, subject.name, look, names, free, settings, irradiance, out, pictures, force, reporter)
-        sight = look.see()
     middle, size = sight.points.mean(axis=0), max(float(np.ptp(sight.points, axis=0).max()), 1e-6)
     distance = lamp_distance_mm or size * (_NEAR if "distance" in find else _FAR)
     begun = given if given is not None else _first_directions(sight, values)
@@ -168,7 +174,7 @@ def _told(
     lines = [f"{out}: residuals are {fitted.scale:.2f} times the noise, {100 * fitted.outliers:.1f} % of the pixels are outliers"]
     # the camera's pose is told as a whole: its numbers count from the last look
     estimates = [e for e in fitted.estimates if not e.name.startswith("camera")]
-    lines += [_line(e.name, e.value, e.low, e.high) for e in estimates if "direction" not in e.name]
+    lines += [_line(e) for e in estimates if "direction" not in e.name]
     lamps = [light.direction for light in fitted.problem.lights]
     lines += [f"  light {k}: towards {three(d)}{_within(fitted, k)}" for k, d in enumerate(lamps)]
     if camera is not None:
@@ -201,10 +207,12 @@ def _camera_lines(camera: CameraFound) -> list[str]:
     ]
 
 
-def _line(name: str, value: float, low: float | None, high: float | None) -> str:
-    return f"  {name:<18} {value:.4g}{_UNITS.get(name.split()[-1], '')}  " + (
-        "not determined" if low is None or high is None else f"{low:.4g} to {high:.4g} (95 %)"
-    )
+def _line(e: Estimate) -> str:
+    if e.low is not None and e.high is not None:
+        known = f"{e.low:.4g} to {e.high:.4g} (95 %)"
+    else:
+        known = "not determined" + (": the end of what is looked for" if e.at_bound else "")
+    return f"  {e.name:<18} {e.value:.4g}{_UNITS.get(e.name.split()[-1], '')}  {known}"
 
 
 def _within(fitted: Fitted, k: int) -> str:
@@ -233,7 +241,27 @@ def _directions(path: Path, count: int) -> FloatArray:
     rows = [row for row in rows if len(row) != 1]
     if any(len(row) != 3 for row in rows) or len(rows) != count:
         raise InputError(path, f"holds {len(rows)} directions for {count} pictures; write x y z for each, in order")
+    for row in rows:
+        if not 0.0 < math.hypot(*row) < math.inf:
+            raise InputError(
+                path, f"holds {' '.join(f'{v:g}' for v in row)}, which is no direction; write x y z, towards the lamp"
+            )
     return np.array(rows)
+
+
+def _refuse_unexposed(sight: Sight, pictures: Sequence[str], values: Sequence[FloatArray], noise: float) -> None:
+    """Raises InputError for a picture that shows no light of what is seen, or none that its sensor could count."""
+    for path, picture in zip(pictures, values):
+        seen = picture.reshape(-1)[sight.pixel]
+        if seen.max() < _LEAST_LIGHT * noise and seen.mean() < noise:
+            raise InputError(
+                path, f"is dark where the object is: at most {seen.max():.2g} of full scale, where noise is {noise:g}; expose longer, or check where "
+                "the object is, and --noise",
+            )  # fmt: skip
+        if (seen < 1.0).sum() < _LEAST_COUNTED:
+            raise InputError(
+                path, "is saturated everywhere on the object, which tells nothing of its shape or material; expose less"
+            )
 
 
 def _first_directions(sight: Sight, values: Sequence[FloatArray]) -> FloatArray:

@@ -38,7 +38,7 @@ def material_of(fitted: Fitted, name: str = "fitted", metal: Material | None = N
     if total > 1.0:
         raise SceneError(
             f"the strengths found add to {total:.3g}, and no surface reflects more than it receives: only their product with the light's "
-            f"irradiance is in the pictures; give an irradiance at least {total:.3g} times as large",
+            f"irradiance is in the pictures; give an irradiance at least {total:.3g} times as large (sRGB pictures taken for linear seem too bright as well)",
             total=total,
         )
     material = Material(

@@ -16,6 +16,8 @@ from rangecheck.recover.sight import sphere_sight
 
 #: share of the picture's brightest from which a pixel belongs to the highlight; lens and sphere blur it, but evenly
 _HIGHLIGHT = 0.5
+#: share of the sphere beyond which what is bright is no lamp in a mirror
+_LARGEST_SPOT = 0.1
 
 
 class Outline(NamedTuple):
@@ -52,6 +54,12 @@ def light_from_chrome(picture: FloatArray, outline: Outline) -> FloatArray:
     spots, count = label(bright, np.ones((3, 3)))
     size = np.bincount(spots.reshape(-1), np.where(bright, np.nan_to_num(values), 0.0).reshape(-1), minlength=count + 1)
     rows, columns = np.nonzero(spots == 1 + int(np.argmax(size[1:])))
+    share = len(rows) / len(seen)
+    if share > _LARGEST_SPOT:
+        raise SceneError(
+            f"{100 * share:.0f} % of the sphere is as bright as its brightest place, and a lamp mirrored in chrome is a small spot; the sphere is matt, or the "
+            "picture saturated", share=share,
+        )  # fmt: skip
     x = (columns.mean() - outline.centre_px[0]) / outline.radius_px
     y = (outline.centre_px[1] - rows.mean()) / outline.radius_px
     normal = np.array([x, y, math.sqrt(max(0.0, 1.0 - x * x - y * y))])

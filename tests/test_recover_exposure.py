@@ -1,0 +1,68 @@
+"""Pictures that hold no light, or more than their sensor counts, are refused in one line each; nothing is written of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rangecheck_cli.main import exit_status
+from test_recover_command import AHEAD, SATIN, SPHERE, save, sphere_picture
+
+from rangecheck.errors import SceneError
+from rangecheck.pipeline.fitting import _line
+from rangecheck.recover.fit import Estimate
+from rangecheck.recover.matt import lights_from_matt
+from rangecheck.recover.spheres import Outline, light_from_chrome
+
+BALL = Outline((60.0, 58.0), 50.0)
+
+
+@pytest.fixture
+def lamps(tmp_path):
+    (tmp_path / "lamps.txt").write_text("0.4 0.3 0.8\n")
+    return str(tmp_path / "lamps.txt")
+
+
+@pytest.mark.parametrize(
+    ("level", "said"), [(0.0, "is dark where the object is"), (1.0, "is saturated everywhere on the object")]
+)
+def test_a_picture_without_light_or_with_too_much_is_no_material(tmp_path, capsys, lamps, level, said):
+    picture = save(tmp_path / "even.png", np.full((120, 121), level), 0.0, 0)
+    assert exit_status(["fit", picture, *SPHERE, "--lights", lamps, "-o", str(tmp_path / "m.toml"), "-q"]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "m.toml").exists()
+
+
+def test_a_picture_of_noise_alone_is_dark(tmp_path, capsys, lamps):
+    picture = save(tmp_path / "noise.png", np.zeros((120, 121)), 0.01, 1)
+    assert exit_status(["fit", picture, *SPHERE, "--lights", lamps, "-o", str(tmp_path / "m.toml"), "-q"]) == 2
+    assert "is dark where the object is" in capsys.readouterr().err
+
+
+def test_a_material_goes_into_a_file_that_materials_are_read_from(tmp_path, capsys, lamps):
+    picture = sphere_picture(tmp_path / "ball.png", SATIN, AHEAD, 2.0)
+    assert exit_status(["fit", picture, *SPHERE, "--lights", lamps, "-o", str(tmp_path / "m.png"), "-q"]) == 2
+    assert "materials are read from .toml" in capsys.readouterr().err
+    assert not (tmp_path / "m.png").exists()
+
+
+@pytest.mark.parametrize("direction", ["nan 0.3 0.8", "0 0 0"])
+def test_a_direction_that_is_none_is_told_by_its_file(tmp_path, capsys, direction):
+    picture = sphere_picture(tmp_path / "ball.png", SATIN, AHEAD, 2.0)
+    (tmp_path / "none.txt").write_text(direction)
+    arguments = ["fit", picture, *SPHERE, "--lights", str(tmp_path / "none.txt"), "-o", str(tmp_path / "m.toml"), "-q"]
+    assert exit_status(arguments) == 2
+    assert "none.txt: holds" in capsys.readouterr().err
+
+
+def test_an_overexposed_ball_shows_no_lamp():
+    with pytest.raises(SceneError, match="saturated where it is lit"):
+        lights_from_matt([np.ones((120, 121))], BALL)
+    with pytest.raises(SceneError, match="a lamp mirrored in chrome is a small spot"):
+        light_from_chrome(np.ones((120, 121)), BALL)
+
+
+def test_a_number_at_the_end_of_what_is_looked_for_says_why_it_is_not_known():
+    ended = Estimate("correlation_um", 0.2775, None, None, at_bound=True)
+    assert _line(ended).endswith("not determined: the end of what is looked for")
+    assert _line(replace(ended, at_bound=False)).endswith("not determined")
+    assert _line(replace(ended, low=0.2, high=0.3)).endswith("0.2 to 0.3 (95 %)")
