@@ -1,6 +1,7 @@
 """A scan against its own brightness image: what is planted in the scan and not in the picture is named at its place, and nothing else."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from rangecheck_cli.main import exit_status
 from rangecheck.analytic.shapes import Sphere
 from rangecheck.errors import ScanError
 from rangecheck.optics import PinholeCamera
+from rangecheck.pipeline.explained import _judged_line
 from rangecheck.recover.compare import compare
 from rangecheck.recover.grid import normals_at, scan_grid
 from rangecheck.recover.lights import Light
@@ -195,3 +197,12 @@ def test_a_scan_without_a_picture_or_without_distances_is_refused():
         compare(replace(scan, brightness=None))
     with pytest.raises(ScanError, match="no cell holds"):
         compare(replace(scan, range_mm=np.full((SIZE, SIZE), np.nan, np.float32)))
+
+
+def test_what_could_be_compared_is_told_apart_from_what_was_judged():
+    least = np.full((10, 10), np.nan)
+    least[:4] = 1.2
+    least[0] = 0.8
+    found = SimpleNamespace(least_mm=least, judged=0.1, paint=0.02, grid=SimpleNamespace(valid=np.ones((10, 10), bool)))
+    said = _judged_line("view", found)
+    assert "10 % of it judged by its brightness to 1 mm, of 40 % that could be compared, where dents of 1.20 mm (median)" in said

@@ -128,7 +128,10 @@ def _judged_line(name: str, found: Comparison) -> str:
             f"{100 * found.paint:.1f} % from the scan's shading in structures of a dent's size (paint, or noise of the ranges), so that only {least}: its shape "
             f"cannot be judged to {JUDGED_MM:g} mm by it"
         )
-    return f"{name}: {100 * found.judged:.0f} % of it judged by its brightness to {JUDGED_MM:g} mm; {least}; elsewhere paint, shadow or grazing light hide the shape"
+    return (
+        f"{name}: {100 * found.judged:.0f} % of it judged by its brightness to {JUDGED_MM:g} mm, of {100 * compared:.0f} % that could be compared, where {least}; "
+        "what is left of that has too much paint or noise of the ranges, the rest is too near to rims, shadows and gaps"
+    )
 
 
 def _places(regions: Sequence[Region], world_from_scan: FloatArray, judged: float) -> list[str]:
