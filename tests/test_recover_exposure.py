@@ -66,3 +66,9 @@ def test_a_number_at_the_end_of_what_is_looked_for_says_why_it_is_not_known():
     assert _line(ended).endswith("not determined: the end of what is looked for")
     assert _line(replace(ended, at_bound=False)).endswith("not determined")
     assert _line(replace(ended, low=0.2, high=0.3)).endswith("0.2 to 0.3 (95 %)")
+
+
+def test_a_material_given_for_a_scene_is_told_from_one(tmp_path, capsys):
+    (tmp_path / "chalk.toml").write_text('description = "Chalk"\nK_lm = 0.8\n')
+    assert exit_status(["render", str(tmp_path / "chalk.toml"), "-o", str(tmp_path / "x.png"), "-q"]) == 2
+    assert "holds a material, no scene; give it as --material" in capsys.readouterr().err

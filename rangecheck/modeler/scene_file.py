@@ -69,6 +69,8 @@ def read_model(path: str | Path) -> Model:
 
 def model_from_dict(document: Mapping[str, Any], folder: str | Path | None = None) -> Model:
     """The scene that `document` describes; mesh files are looked for in `folder` and nowhere above it."""
+    if "body" not in document and any(key.startswith("K_") for key in document):
+        raise SceneError("this file holds a material, no scene; give it as --material, beside a mesh, scan or scene")
     _known("the scene", document, ("name", "tolerance_mm", "camera", "source", "body"))
     rows = document.get("body")
     if not isinstance(rows, list) or not rows:
