@@ -225,11 +225,11 @@ def test_wrong_usage_names_the_help_of_its_own_command(capsys):
 
 
 def test_a_command_that_passes_its_memory_ends_and_says_so(tmp_path):
-    """In a process of its own, which holds nothing before."""
+    """In a process of its own, which holds nothing before; four times the bound, so that a loaded machine looks in time."""
     from rangecheck.export.meshes import write_mesh
     from rangecheck.studies.scenes import ball
 
-    write_mesh(ball(6, 40.0), tmp_path / "ball.ply")
+    write_mesh(ball(8, 40.0), tmp_path / "ball.ply")
     line = ["render", str(tmp_path / "ball.ply"), "--unit", "mm", "--size", "64x64", "-o", str(tmp_path / "ball.png")]
     line += ["--set", "memory_mb=256", "-q"]
     done = subprocess.run([sys.executable, "-m", "rangecheck_cli", *line], capture_output=True, text=True)
