@@ -69,6 +69,15 @@ def test_every_derivative_of_radiance_is_that_of_finite_differences(masking, nod
         assert np.abs(differences - slopes[:, k]).max() < 1e-5 * np.abs(differences).max(), p.name
 
 
+def test_a_lobe_weaker_than_any_that_is_looked_for_widens_what_is_known_of_the_matt_share():
+    matt, lamp = Guess(0.6, 0.0, 0.0, 0.6, 1.6), Light(np.array([0.3, 0.4, 0.8]), 2.0, np.zeros(3), 1e6, 0.25)
+    only = Unknowns(("K_lm",), direction=False)
+    problem = photographed(problem_on(sphere_sight((30, 30), 25, (61, 61)), (lamp,), matt, only, noise=1e-6), 0, 1e-6)
+    found = fit(replace(problem, unknowns=Unknowns(("K_lm", "K_lobe"), direction=False)))
+    known = found.estimate("K_lm")
+    assert found.estimate("K_lobe").at_bound and known.low <= 0.6 <= known.high and known.high - known.low < 1e-4
+
+
 def bumpy_ball():
     surface = ball(3, 50.0)
     wave = 1 + 0.05 * np.sin(surface.vertices @ [0.1, 0.07, 0.05])

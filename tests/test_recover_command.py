@@ -71,6 +71,14 @@ def test_what_the_command_is_asked_to_find_lies_in_its_interval(tmp_path, capsys
     assert width < 0.05 * truth if find != "distance" else width < 0.2 * truth
 
 
+def test_noise_that_is_cut_off_at_black_is_no_ambient_light(tmp_path, capsys):
+    picture = sphere_picture(tmp_path / "0.png", SATIN, ASIDE, 2.0, distance=300.0)
+    options = ["--irradiance", "2", "--find", "ambient", "--find", "distance", "--lamp-distance", "500"]
+    _, found = fitted(capsys, picture, *SPHERE, *options, "-o", str(tmp_path / "m.toml"))
+    # the dark side is on average 0.4 noises too bright
+    assert holds(found["picture 0 ambient"], 0.0, 2.0) and holds(found["light 0 distance"], 300.0, 2.0)
+
+
 def test_a_mirror_shows_how_large_its_lamp_is(tmp_path, capsys):
     mirror = Guess(0.4, 0.25, 1e-4, 0.02, 2.0)
     picture = sphere_picture(tmp_path / "0.png", mirror, AHEAD, 0.05, radius=4.0, noise=0.002)

@@ -19,7 +19,7 @@ from rangecheck.errors import SceneError
 from rangecheck.recover.intervals import profiled
 from rangecheck.recover.polish import TWO_SIDED_95, Estimate, Fitted, polish
 from rangecheck.recover.problem import LENGTHS, Photograph, Problem
-from rangecheck.recover.residuals import robust_cost
+from rangecheck.recover.residuals import robust_cost, undarkened
 from rangecheck.recover.starts import cheapest, families, lamps, mirrors, solve, thin
 
 __all__ = ["TWO_SIDED_95", "Estimate", "Fitted", "elsewhere", "explored", "fit", "followed", "joined", "settled"]
@@ -74,13 +74,14 @@ def explored(
 
 def followed(problem: Problem, states: Sequence[Problem]) -> list[Fitted]:
     """Where some thousands of the problem's pixels lead from these states, the best first, without those that can no longer be the best."""
-    some = thin(problem, _SEVERAL)
+    some = undarkened(_whole(thin(problem, _SEVERAL), states[0]))
     ends = sorted((polish(_whole(some, state)) for state in states), key=lambda f: f.cost)
     return [f for f in ends if f.cost < ends[0].cost + _RIVAL]
 
 
 def settled(problem: Problem, states: Sequence[Problem], *, known_noise: bool = True) -> Fitted:
     """The best end on all pixels from these states, with the intervals of all that explain the pictures as well."""
+    problem = undarkened(_whole(problem, states[0]))
     return joined([polish(_whole(problem, state), known_noise=known_noise) for state in _distinct(states, len(states))])
 
 

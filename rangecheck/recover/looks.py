@@ -23,7 +23,7 @@ from rangecheck.recover.fit import explored, followed, settled
 from rangecheck.recover.lights import Light
 from rangecheck.recover.polish import TWO_SIDED_95, Fitted, accumulate, polish
 from rangecheck.recover.problem import Photograph, Problem
-from rangecheck.recover.residuals import UNTOLD
+from rangecheck.recover.residuals import UNTOLD, undarkened
 from rangecheck.recover.sight import Sight, lit_by, see
 from rangecheck.recover.starts import with_best_strengths
 from rangecheck.scene import Scene
@@ -68,7 +68,7 @@ class Look:
         """The problem at a state, seen from the present pose under that state's lamps."""
         taken = photographs(self.see(step), self.pictures, state.lights, self.noise, self.caster, self.together)
         photos = tuple(replace(t, exposure=p.exposure, ambient=p.ambient) for t, p in zip(taken, state.photographs))
-        return replace(problem, photographs=photos, lights=state.lights, material=state.material)
+        return undarkened(replace(problem, photographs=photos, lights=state.lights, material=state.material))
 
     def move(self, pose: FloatArray) -> None:
         """Move by small turns (rad) and shifts (mm), (6,)."""
@@ -127,7 +127,8 @@ def photographs(
             else lit_by(sight, tuple(lamps[n] for n in shining), caster)
         )
         unsure = UNTOLD * at_the_terminator(sight, [lamps[n] for n in shining])
-        photos.append(Photograph(sight, seen, np.hypot(noise, unsure), lit, shining))
+        floor = 0.0 if (picture <= 0.0).any() and not (picture < 0.0).any() else -math.inf
+        photos.append(Photograph(sight, seen, np.hypot(noise, unsure), lit, shining, floor=floor))
     return tuple(photos)
 
 

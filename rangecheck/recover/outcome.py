@@ -65,7 +65,8 @@ def material_toml(material: Material, fitted: Fitted, source: str) -> str:
     lines = [
         f"description = {_text('Recovered from photographs by rangecheck fit')}",
         f"source = {_text(source)}",
-        *(f"{key} = {float(getattr(material, key)):.9g}" for key in ("K_lm", "K_ss", "K_sl", "K_s")),
+        # enough digits for strengths that add to 1 not to add to more
+        *(f"{key} = {float(getattr(material, key)):.13g}" for key in ("K_lm", "K_ss", "K_sl", "K_s")),
         f"sigma_um = {material.sigma_um:.9g}",
         f"correlation_um = {material.correlation_um:.9g}",
         f"wavelengths_um = [{material.wavelengths_um[0]:.9g}]",

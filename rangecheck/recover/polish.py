@@ -117,8 +117,9 @@ def polish(problem: Problem, *, known_noise: bool = True, steps: int = _POLISH) 
     covariance[np.ix_(free, free)] = determination.covariance * widen
     known = np.zeros(len(parameters), bool)
     known[free] = determination.determined
-    estimates = [estimate_of(problem, p, float(t), float(c), bool(k), bool(f)) for p, t, c, k, f in zip(
-        parameters, theta, np.sqrt(np.diag(covariance)), known, free)]  # fmt: skip
+    unlobed = _without_lobe(problem, theta, normal, free)
+    estimates = [estimate_of(problem, p, float(t), float(c), bool(k), bool(f), float(u)) for p, t, c, k, f, u in zip(
+        parameters, theta, np.sqrt(np.diag(covariance)), known, free, unlobed)]  # fmt: skip
     state, poses = problem.at(theta)
     whole = determination._replace(covariance=covariance, determined=known)
     return Fitted(
@@ -196,6 +197,18 @@ def _inverse(information: FloatArray, units: FloatArray) -> FloatArray:
     return np.asarray(held * units[:, None] * units[None, :])
 
 
+def _without_lobe(problem: Problem, theta: FloatArray, normal: FloatArray, free: BoolArray) -> FloatArray:
+    """(p,) how far the free parameters would move if a lobe that ended at the weakest that is looked for were none at all."""
+    moved = np.zeros(len(theta))
+    parameters = problem.parameters()
+    for k, p in enumerate(parameters):
+        if p.kind == "log strength" and not free[k] and in_own_unit(problem, p, float(theta[k])) <= LEAST_LOBE * (1.0 + 1e-9):
+            # light is linear in the lobe's strength: without it there is less by once its slope by the logarithm
+            units = np.array([q.unit for q in parameters])[free]
+            moved[free] = _inverse(normal[np.ix_(free, free)], units) @ normal[free, k]
+    return moved
+
+
 def in_own_unit(problem: Problem, p: Parameter, theta: float) -> float:
     """A parameter as what it stands for: lengths, strengths, distances themselves instead of their logarithms."""
     match p.kind:
@@ -216,8 +229,12 @@ def in_own_unit(problem: Problem, p: Parameter, theta: float) -> float:
     return float(base * math.exp(theta))
 
 
-def estimate_of(problem: Problem, p: Parameter, theta: float, spread: float, known: bool, free: bool) -> Estimate:
-    """A parameter in its own unit with its interval."""
+def estimate_of(
+    problem: Problem, p: Parameter, theta: float, spread: float, known: bool, free: bool, elsewhere: float = 0.0
+) -> Estimate:
+    """A parameter in its own unit with its interval, which holds that around `theta + elsewhere` too."""
     reach = TWO_SIDED_95 * spread
-    value, low, high = (in_own_unit(problem, p, theta + t) for t in (0.0, -reach, reach))
+    value, low, high = (
+        in_own_unit(problem, p, theta + t) for t in (0.0, min(elsewhere, 0.0) - reach, max(elsewhere, 0.0) + reach)
+    )
     return Estimate(p.name, value, low if known else None, high if known else None, not free)

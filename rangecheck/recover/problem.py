@@ -70,7 +70,7 @@ class Photograph:
     noise     (n,) standard deviation of each
     lit       (n, s) whether the light reaches each point, for the s lights of this picture
     lights    their numbers in `Problem.lights`
-    saturation  where the sensor stops counting
+    saturation  where the sensor stops counting;  floor: below which it shows nothing, so that noise in the dark is cut off there
     exposure, ambient  what multiplies and what is added
     thrown    what is beside the lights' straight light
     """
@@ -81,6 +81,7 @@ class Photograph:
     lit: BoolArray
     lights: tuple[int, ...]
     saturation: float = 1.0
+    floor: float = -math.inf
     exposure: float = 1.0
     ambient: float = 0.0
     thrown: Thrown | None = None

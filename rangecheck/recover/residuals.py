@@ -2,6 +2,9 @@
 
 A pixel at saturation says only that the light was at least so much: its probability is that of the noise carrying the model's light past
 saturation (Tobin 1958), and its residual r is the one whose r^2/2 is minus the logarithm of that.
+
+Where noise is cut off at black, the dark is on average too bright, by how much depends on how noisy the dark is, and that is often not as noisy as what is
+lit. What is within noise of black there tells nothing of ambient light.
 """
 
 from __future__ import annotations
@@ -11,12 +14,14 @@ from dataclasses import replace
 import numpy as np
 
 from rangecheck.arrays import FloatArray
-from rangecheck.recover.problem import Problem
+from rangecheck.recover.problem import Photograph, Problem
 
 #: Huber's bend and the limit beyond which a pixel counts as an outlier, in standard deviations of its noise
 BEND, OUTLIER = 2.5, 6.0
 #: noise, parts of full scale, of a pixel that tells nothing
 UNTOLD = 1.0
+#: noises above the floor up to which a pixel should be for its noise to be cut off (of a Gaussian 0.0004 of a deviation is lost there)
+_CUT_OFF = 3.0
 
 
 def residuals(problem: Problem, theta: FloatArray, which: int, *, slopes: bool = True) -> tuple[FloatArray, FloatArray]:
@@ -40,6 +45,23 @@ def at_least(excess: FloatArray) -> tuple[FloatArray, FloatArray]:
     residual = -np.sqrt(np.maximum(-2.0 * log_chance, 1e-300))
     hazard = np.exp(-0.5 * excess**2 - log_chance) / np.sqrt(2.0 * np.pi)
     return residual, -hazard / residual
+
+
+def undarkened(problem: Problem) -> Problem:
+    """The problem with the pixels telling nothing that at its state are within noise of a picture's floor, where ambient light is looked for: all else
+    multiplies light, of which the dark has none. What is an outlier there, as light where a state has none, still counts."""
+    if not problem.unknowns.ambient:
+        return problem
+    return replace(problem, photographs=tuple(_undarkened(problem, k) for k in range(len(problem.photographs))))
+
+
+def _undarkened(problem: Problem, which: int) -> Photograph:
+    photo = problem.photographs[which]
+    if not np.isfinite(photo.floor):
+        return photo
+    shown = problem.predict(problem.start(), which, slopes=False).values
+    dark = (shown < photo.floor + _CUT_OFF * photo.noise) & (photo.values < photo.floor + OUTLIER * photo.noise)
+    return replace(photo, noise=np.where(dark, np.hypot(photo.noise, UNTOLD), photo.noise))
 
 
 def robust_cost(problem: Problem, theta: FloatArray) -> float:

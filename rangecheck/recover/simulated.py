@@ -26,7 +26,7 @@ from rangecheck.recover.fit import elsewhere, joined
 from rangecheck.recover.looks import CameraFound, Look, camera_found, facing_of, inside_of, moved_by, photographs, stands_still
 from rangecheck.recover.polish import Fitted, accumulate, polish
 from rangecheck.recover.problem import LENGTHS, STRENGTHS, Guess, Problem, Unknowns
-from rangecheck.recover.residuals import robust_cost
+from rangecheck.recover.residuals import robust_cost, undarkened
 from rangecheck.recover.sight import POSE_NUMBERS, Sight, see
 from rangecheck.recover.starts import families, with_best_strengths
 from rangecheck.recover.thrown import NUMBERS, Thrown
@@ -211,7 +211,7 @@ class _Turns:
         asked = self.looks_at()
         for _ in range(turns):
             thrown, variance = self.thrown(problem, asked, thrown)
-            ready = replace(self.at(problem, asked, thrown, variance), reach=_REACH)
+            ready = undarkened(replace(self.at(problem, asked, thrown, variance), reach=_REACH))
             before = accumulate(ready, ready.start())[3]
             fitted = polish(ready, known_noise=False)
             problem = fitted.problem
