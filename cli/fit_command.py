@@ -103,7 +103,8 @@ def command(
     reporter,
 ):
     """Recover material and lamps from photographs of a known shape, one lamp a picture, with 95 % intervals and a statement of what
-    the pictures cannot determine. The material file serves every --material.
+    the pictures cannot determine. The material file serves every --material. Pictures that shape, camera and lamps do not explain are said to be such
+    (exit status 1).
 
     Given one scan with brightness instead of pictures: material and lamp on the scan's own surface, and the places where the scan shows a
     shape that its picture does not (exit status 1); FILE is then a picture (.png) of where."""

@@ -40,6 +40,9 @@ COMMANDS = {
     "doctor": "Say what is installed, what is missing, and the line that mends it.",
 }
 
+#: commands that go on, when they are given again, from where they were stopped
+RESUMED = ("run", "turntable", "dataset")
+
 
 class Commands(click.Group):
     """Finds commands in modules of the same name."""
@@ -101,7 +104,10 @@ def exit_status(arguments: list[str] | None = None) -> int:
         asked = error.ctx.command_path if isinstance(error, click.UsageError) and error.ctx else ""
         return _complain(error.format_message(), hint=asked)
     except (KeyboardInterrupt, click.exceptions.Abort):
-        return _complain("interrupted; what was finished is kept", status=130)
+        kept = _command_of(sys.argv[1:] if arguments is None else arguments) in RESUMED
+        return _complain(
+            "interrupted" + "; what was finished is kept, and the same command goes on from there" * kept, status=130
+        )
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
@@ -116,6 +122,10 @@ def exit_status(arguments: list[str] | None = None) -> int:
             where = f"{error.filename}: " if error.filename else ""
             return _complain(f"{where}{error.strerror or error}")
         raise
+
+
+def _command_of(arguments: list[str]) -> str:
+    return next((argument for argument in arguments if argument in COMMANDS), "")
 
 
 def _complain(message: str, *, status: int = 2, hint: str = "") -> int:

@@ -287,3 +287,14 @@ def test_doctor_keeps_what_packages_print_off_its_document_and_names_the_librari
     checks = {row["name"]: row for row in json.loads(capfd.readouterr().out)["checks"]}
     assert checks["pymeshlab"]["state"] == "broken" and "libOpenGL.so.0" in checks["pymeshlab"]["detail"]
     assert "libopengl0" in checks["pymeshlab"]["mend"]
+
+
+@pytest.mark.parametrize(("command", "kept"), [("fit", False), ("check", False), ("run", True), ("turntable", True)])
+def test_what_a_stopped_command_keeps_is_said_of_those_that_go_on_from_there(monkeypatch, capsys, command, kept):
+    def stopped(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "main", stopped)
+    assert exit_status([command, "x"]) == 130
+    said = capsys.readouterr().err
+    assert "interrupted" in said and ("what was finished is kept" in said) == kept

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -10,6 +11,7 @@ from rangecheck.errors import InputError, ScanError
 from rangecheck.optics import PinholeCamera
 from rangecheck.rigid import inverse, look_at, move_directions, move_points
 from rangecheck.scan.decode import Pictures, Reason, View, decode_gray_code, read_capture
+from rangecheck.scan.decode.capture import read_grey
 from rangecheck.scan.decode.code import boundary
 
 BITS, CELLS = 6, 64
@@ -380,3 +382,12 @@ def test_alexanders_bust_is_decoded_although_pictures_are_missing(real_data):
     reference = np.array([[float(word) for word in words[1:4]] for words in lines])
     away = cKDTree(reference).query(decoded.scan.points_mm()[::20])[0]
     assert np.median(away) <= 0.2 and np.percentile(away, 90) <= 0.5
+
+
+def test_a_grey_picture_of_sixteen_bits_keeps_its_numbers_in_every_format(tmp_path):
+    counts = np.arange(0, 65536, 13, dtype=np.uint16)[:5000].reshape(50, 100)
+    for name in ("counts.png", "counts.pgm"):
+        cv2.imwrite(str(tmp_path / name), counts)
+        for green in (False, True):
+            read = read_grey(tmp_path / name, green=green)
+            assert read.dtype == np.uint16 and (read == counts).all()

@@ -8,18 +8,23 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rangecheck.arrays import FloatArray
-from rangecheck.errors import SceneError, SettingError
+from rangecheck.errors import InputError, SceneError, SettingError
 from rangecheck.files import write_bytes
 from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.subject import hashes
 from rangecheck.recover.fit import Fitted
 
+if TYPE_CHECKING:
+    from rangecheck.recover.spheres import Outline
+
 KINDS = ("chrome", "matt", "bust")
+#: share of outliers from which pictures count as not explained
+_UNEXPLAINED = 0.25
 
 
 def check_kind(kind: str, sphere: Any, model: Any, same_strength: bool) -> None:
@@ -39,15 +44,20 @@ def on_sphere(
     """Lamps found on pictures of a chrome or matt sphere (column, row, radius in pixels), seen from far away: x right, y up, z to the camera."""
     from rangecheck.recover.matt import lights_from_matt
     from rangecheck.recover.matt_ball import PAINTED
-    from rangecheck.recover.spheres import Outline, light_from_chrome
+    from rangecheck.recover.spheres import Outline
 
     outline = Outline((sphere[0], sphere[1]), sphere[2])
     more: dict[str, Any] = {}
     lines: list[str] = []
     if kind == "chrome":
-        directions = np.array([light_from_chrome(v, outline) for v in values])
+        directions = np.array([_by_chrome(p, v, outline) for p, v in zip(pictures, values)])
     else:
-        found = lights_from_matt(values, outline, same_strength=same_strength)
+        try:
+            found = lights_from_matt(values, outline, same_strength=same_strength)
+        except SceneError as refusal:
+            if "picture" in refusal.measured:
+                raise InputError(pictures[refusal.measured["picture"]], str(refusal), **refusal.measured) from None
+            raise
         directions = found.directions
         more = {"gains": found.gains, "slope": found.slope, "gloss": found.surface.gloss, "paint": found.spread, "rms": found.rms,
                 "apart": found.apart, "uneven": found.uneven, "closeness": found.closeness}  # fmt: skip
@@ -75,6 +85,16 @@ def on_sphere(
     return Outcome(document("lights", kind=kind, directions=directions, inputs=hashes(list(pictures)), **more), lines)
 
 
+def _by_chrome(path: str, picture: FloatArray, outline: Outline) -> FloatArray:
+    """(3,) the lamp of one picture of a chrome sphere. Raises InputError where it shows none."""
+    from rangecheck.recover.spheres import light_from_chrome
+
+    try:
+        return light_from_chrome(picture, outline)
+    except SceneError as refusal:
+        raise InputError(path, str(refusal), **refusal.measured) from None
+
+
 def on_bust(fitted: Fitted, pictures: Sequence[str], out: str | None, force: bool, seconds: dict[str, float]) -> Outcome:
     """The lamps of a fit to pictures of a bust: directions from its middle, in its own axes, and how well they are known."""
     lamps = fitted.problem.lights
@@ -87,7 +107,11 @@ def on_bust(fitted: Fitted, pictures: Sequence[str], out: str | None, force: boo
         )
     strengths = np.array([light.irradiance for light in lamps])
     _write(directions, out, force)
-    lines = [f"residuals are {fitted.scale:.2f} times the noise, {100 * fitted.outliers:.1f} % of the pixels are outliers"]
+    unexplained = said_of_outliers(fitted)
+    lines = [
+        f"residuals are {fitted.scale:.2f} times the noise, {100 * fitted.outliers:.1f} % of the pixels are outliers",
+        *unexplained,
+    ]
     lines += [
         f"{Path(p).name}: towards {three(d)}, within {w:.2g} degrees (95 %), strength {s / strengths[0]:.4f} of the first"
         for p, d, w, s in zip(pictures, directions, within, strengths)
@@ -96,9 +120,20 @@ def on_bust(fitted: Fitted, pictures: Sequence[str], out: str | None, force: boo
         lines.append("the fit did not settle; give better guesses of the lights, or more pictures")
     content = document(
         "lights", kind="bust", directions=directions, inputs=hashes(list(pictures)), within_deg=within, strengths=strengths / strengths[0],
-        residual_in_noises=fitted.scale, converged=fitted.converged, seconds=seconds,
+        residual_in_noises=fitted.scale, converged=fitted.converged, fit=not unexplained, seconds=seconds,
     )  # fmt: skip
-    return Outcome(content, lines)
+    return Outcome(content, lines, not unexplained)
+
+
+def said_of_outliers(fitted: Fitted) -> list[str]:
+    """That the pictures are not explained, where so many pixels are outliers that those left may be the wrong ones."""
+    if fitted.outliers < _UNEXPLAINED:
+        return []
+    return [
+        f"the pictures are not explained: {100 * fitted.outliers:.0f} % of the pixels show something else than this shape does under such lamps, the others by "
+        f"{fitted.scale:.1f} times the noise; check what was given of the shape, the camera and the lamps (--on or --sphere, --camera, --field, --lights, or "
+        "--find pose), --response, and --noise"
+    ]
 
 
 def within_deg(fitted: Fitted, k: int) -> float | None:

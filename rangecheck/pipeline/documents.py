@@ -278,7 +278,7 @@ def _documents() -> dict[str, tuple[Any, ...]]:
         "fit": (
             "`fit` of a material to photographs",
             record(output=TEXT, estimates=many(fields_of(Estimate)), lights=many(POINT), not_determined=TEXTS, residual_in_noises=NUMBER,
-                   rms=NUMBER, outliers=NUMBER, converged=FLAG, inputs=NAMES, seconds=NUMBERS, world_from_camera=or_null(POSE),
+                   rms=NUMBER, outliers=NUMBER, converged=FLAG, fit=FLAG, inputs=NAMES, seconds=NUMBERS, world_from_camera=or_null(POSE),
                    camera_within_mm=or_null(POINT), camera_turn_within_deg=or_null(NUMBER)),
         ),
         "lights": (
@@ -286,7 +286,7 @@ def _documents() -> dict[str, tuple[Any, ...]]:
             record(kind=one_of("chrome", "matt", "bust"), directions=many(POINT), inputs=NAMES, gains=maybe(many(NUMBER)), slope=maybe(NUMBER),
                    gloss=maybe(NUMBER), paint=maybe(NUMBER), rms=maybe(NUMBER), apart=maybe(many(NUMBER)), uneven=maybe(many(many(NUMBER))),
                    closeness=maybe(many(NUMBER)), within_deg=maybe(many(NUMBER)), strengths=maybe(many(NUMBER)), residual_in_noises=maybe(NUMBER),
-                   converged=maybe(FLAG), seconds=maybe(NUMBERS)),
+                   converged=maybe(FLAG), fit=maybe(FLAG), seconds=maybe(NUMBERS)),
         ),
         "explained": (
             "`fit` of a scan to its own brightness",

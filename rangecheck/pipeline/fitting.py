@@ -12,10 +12,10 @@ import numpy as np
 
 from rangecheck import rigid
 from rangecheck.arrays import FloatArray
-from rangecheck.errors import InputError, SettingError
+from rangecheck.errors import InputError, SceneError, SettingError
 from rangecheck.files import read_bytes, write_bytes
 from rangecheck.optics import PinholeCamera, Sensor
-from rangecheck.pipeline.calibrating import check_kind, on_bust, on_sphere, three, within_deg
+from rangecheck.pipeline.calibrating import check_kind, on_bust, on_sphere, said_of_outliers, three, within_deg
 from rangecheck.pipeline.fitting_scene import SceneSimulator, faces_of, field_of, lamps_of, own_material, scene_looked_at
 from rangecheck.pipeline.outcome import Outcome, document
 from rangecheck.pipeline.subject import Subject, hashes, read_subject
@@ -165,10 +165,16 @@ def _told(
     fitted: Fitted, out: str | None, pictures: Sequence[str], force: bool, reporter: Reporter, camera: CameraFound | None,
     metal: Material | None = None,
 ) -> Outcome:  # fmt: skip
-    from rangecheck.recover.outcome import material_of, material_toml
+    from rangecheck.recover.outcome import material_of, material_toml, with_what_is_taken
 
     assert out is not None
-    material, assumed = material_of(fitted, Path(out).stem, metal)
+    unexplained = said_of_outliers(fitted)
+    try:
+        material, assumed = material_of(fitted, Path(out).stem, metal)
+    except SceneError as refusal:
+        # where the shape is another one, it is not the lamps' irradiance that is wrong
+        raise SceneError(f"no material is found: {unexplained[0]}", **refusal.measured) from None if unexplained else refusal
+    fitted = with_what_is_taken(fitted, material, unexplained)
     names = ", ".join(Path(p).name for p in pictures)
     write_bytes(out, material_toml(material, fitted, f"fitted to {names}").encode(), force=force)
     lines = [f"{out}: residuals are {fitted.scale:.2f} times the noise, {100 * fitted.outliers:.1f} % of the pixels are outliers"]
@@ -180,7 +186,8 @@ def _told(
     if camera is not None:
         lines += _camera_lines(camera)
     lines += assumed
-    lines += [f"not determined: {said}" for said in fitted.statements]
+    lines[1:1] = unexplained
+    lines += [f"not determined: {said}" for said in fitted.statements if said not in unexplained]
     if not fitted.converged:
         lines.append("the fit did not settle; give better guesses of the lights, or more pictures")
     content = document(
@@ -188,9 +195,9 @@ def _told(
         world_from_camera=None if camera is None else camera.world_from_camera,
         camera_within_mm=None if camera is None else camera.within_mm,
         camera_turn_within_deg=None if camera is None or camera.turn_within_rad is None else math.degrees(camera.turn_within_rad), residual_in_noises=fitted.scale, rms=fitted.rms, outliers=fitted.outliers, converged=fitted.converged,
-        inputs=hashes(list(pictures)), seconds=reporter.seconds,
+        fit=not unexplained, inputs=hashes(list(pictures)), seconds=reporter.seconds,
     )  # fmt: skip
-    return Outcome(content, lines)
+    return Outcome(content, lines, not unexplained)
 
 
 def _camera_lines(camera: CameraFound) -> list[str]:

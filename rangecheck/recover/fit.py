@@ -20,6 +20,7 @@ from rangecheck.recover.intervals import profiled
 from rangecheck.recover.polish import TWO_SIDED_95, Estimate, Fitted, polish
 from rangecheck.recover.problem import LENGTHS, Photograph, Problem
 from rangecheck.recover.residuals import robust_cost, undarkened
+from rangecheck.recover.spots import untold, without_spots
 from rangecheck.recover.starts import cheapest, families, lamps, mirrors, solve, thin
 
 __all__ = ["TWO_SIDED_95", "Estimate", "Fitted", "elsewhere", "explored", "fit", "followed", "joined", "settled"]
@@ -28,6 +29,8 @@ __all__ = ["TWO_SIDED_95", "Estimate", "Fitted", "elsewhere", "explored", "fit",
 _RIVAL, _AS_GOOD = 12.0, 1.9208
 #: starts under other lamps than those given
 _OTHER_LAMPS = 4
+#: how often spots are looked for: the first fit was pulled by them
+_SPOTS = 3
 #: pixels on which rivals are told apart before all are used
 _SEVERAL = 16000
 
@@ -80,9 +83,19 @@ def followed(problem: Problem, states: Sequence[Problem]) -> list[Fitted]:
 
 
 def settled(problem: Problem, states: Sequence[Problem], *, known_noise: bool = True) -> Fitted:
-    """The best end on all pixels from these states, with the intervals of all that explain the pictures as well."""
-    problem = undarkened(_whole(problem, states[0]))
-    return joined([polish(_whole(problem, state), known_noise=known_noise) for state in _distinct(states, len(states))])
+    """The best end on all pixels from these states, with the intervals of all that explain the pictures as well; without spots that nothing explains."""
+    problem, states = undarkened(_whole(problem, states[0])), _distinct(states, len(states))
+    ended = [polish(_whole(problem, state), known_noise=known_noise) for state in states]
+    silent, pixels = untold(problem), sum(len(photo.sight) for photo in problem.photographs)
+    for _ in range(_SPOTS):
+        spotless = without_spots(problem, min(ended, key=lambda f: f.cost))
+        if spotless is None:
+            break
+        problem = spotless
+        ended = [polish(_whole(problem, f.problem), known_noise=known_noise) for f in ended]
+    found = joined(ended)
+    told, spots = pixels - silent, untold(problem) - silent
+    return replace(found, outliers=found.outliers * (told - spots) / max(1, told) + spots / max(1, told)) if spots else found
 
 
 def joined(ended: Sequence[Fitted]) -> Fitted:

@@ -76,7 +76,7 @@ def lights_from_matt(
     few = _thinned(whole, _PIXELS)
     values = [np.nan_to_num(np.asarray(p, np.float64)).reshape(-1)[few.pixel] for p in pictures]
     begin = np.array(
-        [_brightest(few, v, saturation) if starts is None else starts[k] * float(v.max()) for k, v in enumerate(values)]
+        [_brightest(few, v, saturation, k) if starts is None else starts[k] * float(v.max()) for k, v in enumerate(values)]
     )
     ball = MattBall(few, pictures, saturation, begin, rough=rough, same_strength=same_strength)
     ball.solve()
@@ -100,13 +100,13 @@ def _thinned(whole: Sight, pixels: int) -> Sight:
     return facing.only(np.arange(0, len(facing), max(1, len(facing) // pixels)))
 
 
-def _brightest(sight: Sight, values: FloatArray, saturation: float) -> FloatArray:
-    """(3,) lamp of a matt sphere by linear least squares over the brighter half: direction times gain."""
+def _brightest(sight: Sight, values: FloatArray, saturation: float, picture: int) -> FloatArray:
+    """(3,) lamp of a matt sphere by linear least squares over the brighter half: direction times gain. Errors keep the `picture`'s number."""
     used = values > 0.5 * values.max()
     if not values.max() > 0.0 or used.sum() < 10:
-        raise SceneError("the sphere is dark; no lamp can be found on it")
+        raise SceneError("the sphere is dark; no lamp can be found on it", picture=picture)
     if (values < saturation).sum() < 10 or (values[used] < saturation).sum() < 10:
-        raise SceneError("the sphere is saturated where it is lit; no lamp can be found on it: expose less")
+        raise SceneError("the sphere is saturated where it is lit; no lamp can be found on it: expose less", picture=picture)
     return np.asarray(np.linalg.lstsq(sight.normals[used], values[used], rcond=None)[0])
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from rangecheck.errors import SceneError
 from rangecheck.recover.fit import TWO_SIDED_95, Estimate, Fitted
+from rangecheck.recover.problem import Guess
 from rangecheck.reflectance import Material
 
 
@@ -29,7 +32,7 @@ def material_of(fitted: Fitted, name: str = "fitted", metal: Material | None = N
             )
     both = min(guess.K_spike, guess.K_lobe)
     total = guess.K_lm + max(guess.K_spike, guess.K_lobe)
-    if 1.0 < total <= 1.0 + TWO_SIDED_95 * max(_spread_of_total(fitted), 1e-9):
+    if 1.0 < total <= 1.0 + TWO_SIDED_95 * max(_spread_of_total(fitted, guess), 1e-9):
         said.append(
             f"the strengths found add to {total:.4g}, within their uncertainty 1, the most that there is: they are made that"
         )
@@ -48,9 +51,17 @@ def material_of(fitted: Fitted, name: str = "fitted", metal: Material | None = N
     return material, said
 
 
-def _spread_of_total(fitted: Fitted) -> float:
-    """Standard deviation of K_lm and the stronger of spike and lobe together."""
-    guess = fitted.problem.material
+def with_what_is_taken(fitted: Fitted, material: Material, said: Sequence[str] = ()) -> Fitted:
+    """The fit with what `material` holds instead of strengths that the pictures do not determine, and with more that is to be said of it."""
+    spike, lobe, both = (float(np.asarray(k)) for k in (material.K_ss, material.K_sl, material.K_s))
+    taken = {"K_lm": float(np.asarray(material.K_lm)), "K_spike": spike + both, "K_lobe": lobe + both}
+    estimates = [replace(e, value=taken[e.name]) if e.low is None and e.name in taken else e for e in fitted.estimates]
+    statements = (*said, *fitted.statements)
+    return replace(fitted, estimates=estimates, determination=fitted.determination._replace(statements=statements))
+
+
+def _spread_of_total(fitted: Fitted, guess: Guess) -> float:
+    """Standard deviation of K_lm and the stronger of spike and lobe together, at `guess`."""
     names = ["K_lm", "K_spike" if guess.K_spike > guess.K_lobe else "K_lobe"]
     by = np.array([(p.name in names) * (guess.K_lobe if p.name == "K_lobe" else 1.0) for p in fitted.parameters])
     return float(np.sqrt(by @ fitted.determination.covariance @ by))

@@ -89,8 +89,11 @@ def read_grey(path: Path, *, green: bool = False) -> Picture:
             warnings.simplefilter("ignore")
             picture = Image.open(io.BytesIO(content), formats=("JPEG", "PNG", "BMP", "PPM"))
             check_cells(path, *picture.size)
-            if green and picture.mode not in ("L", "I;16"):
+            if green and picture.mode not in ("L", "I;16", "I"):
                 return np.asarray(picture.convert("RGB").getchannel("G"))
+            if picture.mode == "I":
+                # what PGM of more than 8 bits becomes: 0 to 65535 in 32 bits, which a conversion to grey would cut off at 255
+                return np.asarray(picture).astype(np.uint16)
             return np.asarray(picture if picture.mode in ("L", "I;16") else picture.convert("L"))
     except InputError:
         raise
