@@ -10,6 +10,7 @@ import pytest
 from rangecheck_cli.main import exit_status
 from test_recover_command import fitted, holds, save
 
+from rangecheck.config import load_settings
 from rangecheck.modeler import read_model
 from rangecheck.pipeline.pictures import scene_of
 from rangecheck.pipeline.subject import Subject
@@ -213,3 +214,29 @@ def test_chance_in_smooth_light_is_shared_and_detail_is_kept():
     assert abs(np.average(calm - truth, weights=1.0 / (variance + 1e-4))) < 5.0 * np.sqrt(variance.mean() / len(calm))
     sharp, _ = calmed(sight, detail, np.full(len(sight), 1e-6), label, 1)
     assert np.abs(sharp - detail).max() < 1e-3
+
+
+def test_a_fitted_material_says_how_well_it_is_known_wherever_it_is_taken(tmp_path, capsys):
+    material, small = tmp_path / "fitted.toml", ["--size", "32x24"]
+    material.write_text(FITTED.replace("[]", '["the pictures do not determine sigma_um"]') + "sigma_um = []\n")
+    scene = ball_and_block(tmp_path, material, "brass")
+    known = "K_lm 0.4 (0.39 to 0.41), sigma_um 0.15 (not determined)"
+    for command in (
+        ["materials", str(material)],
+        ["render", scene, "-o", str(tmp_path / "seen.png"), *small],
+        ["turntable", scene, "-o", str(tmp_path / "turn.mp4"), "--frames", "2", *small],
+    ):
+        capsys.readouterr()
+        assert exit_status([*command, "-q"]) == 0
+        said = capsys.readouterr().out
+        assert known in said and "not determined: the pictures do not determine sigma_um" in said
+        assert ("fitted: fitted to pictures" in said) == (command[0] != "materials")
+    material.write_text(FITTED.replace("[0.39, 0.41]", '"about 0.4"'))
+    assert exit_status(["materials", str(material), "-q"]) == 2
+    assert "its uncertainty cannot be read" in capsys.readouterr().err
+
+
+def test_a_job_s_file_finds_its_material_beside_itself(tmp_path):
+    (tmp_path / "satin.toml").write_text(SATIN)
+    (tmp_path / "job.toml").write_text('[light]\nmaterials = ["satin.toml", "steel", "nowhere.toml"]\n')
+    assert load_settings(tmp_path / "job.toml").light.materials == (str(tmp_path / "satin.toml"), "steel", "nowhere.toml")

@@ -61,9 +61,20 @@ def _read(file: str | Path) -> dict[str, Any]:
             raise InputError(file, f"is neither a TOML file nor a preset; presets are {known}")
         path = preset
     try:
-        return tomllib.loads(read_bytes(path).decode())
+        tree = tomllib.loads(read_bytes(path).decode())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(path, f"is not valid TOML ({error}); correct it and try again") from None
+    light = tree.get("light")
+    if isinstance(light, dict) and isinstance(light.get("materials"), list):
+        light["materials"] = [_beside(path, name) for name in light["materials"]]
+    return tree
+
+
+def _beside(settings: Path, name: Any) -> Any:
+    """A material's file as the settings' file has it: from where the command runs, else beside the settings."""
+    if not isinstance(name, str) or not name.endswith(".toml") or Path(name).is_file():
+        return name
+    return str(settings.parent / name) if (settings.parent / name).is_file() else name
 
 
 def _value(text: str) -> Any:

@@ -167,7 +167,8 @@ class Light(Section):
     """How light is followed."""
 
     materials: tuple[str, ...] = Field(
-        ("plaster", "steel"), description="one turntable each; names of configs/materials or paths of material files"
+        ("plaster", "steel"),
+        description="one turntable each; names of configs/materials or paths of material files, from where the command runs or beside this file",
     )
     model: Literal["direct", "plan", "full", "report"] = Field(
         "direct",

@@ -302,7 +302,7 @@ def _documents() -> dict[str, tuple[Any, ...]]:
         "materials": (
             "`materials`",
             record(materials=many(record(name=TEXT, description=TEXT, source=TEXT, sigma_um=NUMBER, correlation_um=NUMBER, concerns=TEXTS,
-                                         energy=many(NUMBERS)))),
+                                         stated=TEXTS, energy=many(NUMBERS)))),
         ),
         "explain": ("`explain`: all codes, or one", record(codes=many(explanation)), explanation),
         "doctor": (

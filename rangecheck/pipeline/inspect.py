@@ -159,6 +159,7 @@ def materials(names: Sequence[str], out: str | None, *, force: bool, reporter: R
             rows = energy_table(material)
         lines.append(f"{material.name}: {material.description}")
         lines.append(f"  sigma {material.sigma_um:g} um, T {material.correlation_um:g} um; {material.source}")
+        lines += [f"  {said}" for said in material.stated]
         lines += [f"  beware: {concern}" for concern in material.concerns()]
         lines.append("  wavelength  angle  diffuse  spike   lobe    total   as published")
         lines += [
@@ -176,6 +177,7 @@ def materials(names: Sequence[str], out: str | None, *, force: bool, reporter: R
                 "sigma_um": material.sigma_um,
                 "correlation_um": material.correlation_um,
                 "concerns": material.concerns(),
+                "stated": material.stated,
                 "energy": rows,
             }
         )

@@ -79,6 +79,12 @@ def _direct_plan(scene: Scene, samples: int) -> Plan:
     return Plan("direct", 0.0, followed, None, grey, reasons=reasons)
 
 
+def known_of(scene: Scene) -> list[str]:
+    """How well the numbers of the scene's materials are known, where fits say so; of several materials each by its name."""
+    told = [(material.name, said) for material in scene.materials for said in material.stated]
+    return [said if len(scene.materials) == 1 else f"{name}: {said}" for name, said in told]
+
+
 def render(
     path: str,
     out: str,
@@ -102,6 +108,7 @@ def render(
         tracer = Tracer(scene_of(subject, material, direct=settings.light.model == "direct"))
         plan = plan_of(tracer, optics.camera, pose, settings, still=True)
         film, said = take(tracer, optics, pose, plan, settings.seed)
+        known = known_of(tracer.scene)
         del tracer  # of a large mesh it is far more than the picture
     exposure = settings.picture.exposure or exposure_from([film.radiance])
     write_png(out, developed(image_of(film, optics), exposure, optics, settings.seed), force=force)
@@ -111,7 +118,7 @@ def render(
         # the others know no other camera
         write_opencv_yaml(beside.with_suffix(".opencv.yaml"), camera, pose)
         write_colmap(beside.with_suffix(".colmap"), [camera], [pose], [beside.name.replace(" ", "_")])
-    explained = [line for line in (*plan.explain(), seen_by(camera), *optics.reasons, *said) if line]
+    explained = [line for line in (*known, *plan.explain(), seen_by(camera), *optics.reasons, *said) if line]
     lines = [f"{out}: {camera.width}x{camera.height}, {material.name}, mean radiance {film.mean_radiance:.4g}", *explained]
     return Outcome(
         document("render", output=out, material=material.name, camera=camera.to_dict(), world_from_camera=pose, exposure=exposure,

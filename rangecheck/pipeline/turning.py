@@ -29,7 +29,7 @@ from rangecheck.optics import PinholeCamera
 from rangecheck.pipeline.camera import camera_of, optics_of
 from rangecheck.pipeline.consistency import Standing, judge, standing_in_frames, standing_in_waves, write_consistency
 from rangecheck.pipeline.outcome import Outcome, document
-from rangecheck.pipeline.pictures import plan_of, scene_of
+from rangecheck.pipeline.pictures import known_of, plan_of, scene_of
 from rangecheck.pipeline.subject import Subject, read_subject
 from rangecheck.pipeline.turning_job import Job, encoded, exposure_of, frames_of, picture_of
 from rangecheck.pipeline.views import orbit_of, refuse_existing
@@ -138,7 +138,7 @@ def _planned(
                 plan = dataclasses.replace(
                     plan, grey=True, reasons=(*plan.reasons, "one wavelength: stripes show slope, not colour")
                 )
-            said = [*plan.explain(), *said]
+            said = [*(known_of(scene) if show == "picture" else ()), *plan.explain(), *said]
             if optics.lens is not None:
                 said.append(
                     f"defocus: traced where circles of confusion exceed half a pixel, focused at {optics.lens.focus_mm:.4g} mm"

@@ -61,6 +61,7 @@ class Material:
     source              where the numbers are from
     masking             none, smith or v-groove
     bounded             keep lobe + spike within 1 at every angle
+    stated              how well the numbers are known, in lines for people, where a fit says so
 
     Raises SceneError for numbers outside these ranges.
     """
@@ -80,6 +81,7 @@ class Material:
     bounded: bool = True
     description: str = field(default="", repr=False)
     source: str = field(default="", repr=False)
+    stated: tuple[str, ...] = field(default=(), repr=False)
 
     def __post_init__(self) -> None:
         if not self.wavelengths_um or not all(0.0 < w < math.inf for w in self.wavelengths_um):
@@ -260,7 +262,7 @@ def _material_from(path: Path, document: dict[str, Any]) -> Material:
     if not isinstance(index, dict):
         raise InputError(path, f"its index is {index!r}; it must be a table with {', '.join(_INDEX_KEYS)}")
     # what a fit says of its own numbers is for people and programs, not for light
-    values.pop("uncertainty", None)
+    uncertainty = values.pop("uncertainty", {})
     unknown = [key for key in document if key not in _KEYS] + [f"index.{key}" for key in index if key not in _INDEX_KEYS]
     if unknown:
         raise InputError(path, f"unknown key {unknown[0]}; a material has {', '.join(_KEYS)}", unknown=unknown)
@@ -274,8 +276,30 @@ def _material_from(path: Path, document: dict[str, Any]) -> Material:
     try:
         if index:
             values.update(index_um=tuple(index["wavelengths_um"]), n=tuple(index["n"]), k=tuple(index["k"]))
-        return Material(name=path.stem, **values)
+        material = Material(name=path.stem, **values)
     except (TypeError, KeyError, OverflowError) as error:
         raise InputError(path, f"does not describe a material ({error})") from None
     except SceneError as error:
         raise InputError(path, str(error), **error.measured) from None
+    return replace(material, stated=_stated(path, material, uncertainty)) if uncertainty != {} else material
+
+
+def _stated(path: Path, material: Material, uncertainty: Any) -> tuple[str, ...]:
+    """What a fit's table `uncertainty` says, in lines: 95 % intervals beside the numbers that they are of, and what is not determined."""
+    known = {"K_lm": ("K_lm",), "K_spike": ("K_ss", "K_s"), "K_lobe": ("K_sl", "K_s")}
+    try:
+        residual, missing = float(uncertainty["residual_in_noises"]), [str(said) for said in uncertainty["not_determined"]]
+        numbers = []
+        for name, interval in uncertainty.items():
+            if name in ("residual_in_noises", "not_determined"):
+                continue
+            value = sum(float(np.max(getattr(material, key))) for key in known.get(name, (name,)))
+            low_high = f"{interval[0]:.4g} to {interval[1]:.4g}" if interval else "not determined"
+            numbers.append(f"{name} {value:.4g} ({low_high})")
+    except (TypeError, KeyError, ValueError, AttributeError, IndexError) as error:
+        raise InputError(
+            path,
+            f"its uncertainty cannot be read ({error}); a fit writes residual_in_noises, not_determined and [low, high] of each number",
+        ) from None
+    fitted = f"fitted to pictures, with 95 % intervals: {', '.join(numbers)}; residuals {residual:.4g} times the noise"
+    return (fitted, *(f"not determined: {said}" for said in missing))

@@ -65,6 +65,7 @@ def report_html(content: ReportContent) -> str:
         content=content,
         data=data,
         frames_note=frames_note,
+        hides={"plaster", "steel"} <= {table["name"] for table in tables},
         sphere=None if content.coverage is None else halves(content.coverage),
         seen=None if content.coverage is None else seen_share(content.coverage.counts),
         embedded=_light,
