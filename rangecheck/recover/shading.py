@@ -45,7 +45,8 @@ def shading_of(fitted: Fitted, grid: ScanGrid, cell: IntArray) -> Shading:
     taken = problem.photographs[0]
     lights = len(problem.lights)
     photo = Photograph(
-        sight, np.zeros(n), np.ones(n), np.ones((n, lights), bool), tuple(range(lights)), taken.saturation, taken.exposure, taken.ambient
+        sight, np.zeros(n), np.ones(n), np.ones((n, lights), bool), tuple(range(lights)), saturation=taken.saturation, exposure=taken.exposure,
+        ambient=taken.ambient,
     )  # fmt: skip
     there = Problem((photo,), problem.lights, problem.material, Unknowns((), direction=False), problem.nodes)
     return Shading(there, np.nan_to_num(grid.picture.reshape(-1)[cell]), taken.saturation)
