@@ -11,8 +11,12 @@ from test_recover_command import AHEAD, SATIN, SPHERE, fitted, holds, save, sphe
 from rangecheck.errors import SceneError
 from rangecheck.pipeline.fitting import _line
 from rangecheck.recover.fit import Estimate
+from rangecheck.recover.lights import Light
 from rangecheck.recover.matt import lights_from_matt
-from rangecheck.recover.problem import Guess
+from rangecheck.recover.outcome import as_far_as_known
+from rangecheck.recover.polish import polish
+from rangecheck.recover.problem import Guess, Photograph, Problem, Unknowns
+from rangecheck.recover.sight import sphere_sight
 from rangecheck.recover.spheres import Outline, light_from_chrome
 from rangecheck.reflectance import load_material
 
@@ -116,3 +120,13 @@ def test_a_soft_reflection_on_a_ball_does_not_pull_its_material(tmp_path, capsys
     assert holds(found["K_lm"], SATIN.K_lm) and holds(found["K_lobe"], SATIN.K_lobe)
     # the glow is seen within three of its widths, 5 % of the ball
     assert 0.04 < document["outliers"] < 0.1
+
+
+def test_a_fit_that_did_not_settle_states_no_interval(tmp_path):
+    sight = sphere_sight((20, 20), 18, (41, 41))
+    lamp = Light(AHEAD, 2.0, np.zeros(3), 1e6, 0.25)
+    photo = Photograph(sight, np.full(len(sight), 0.3), np.full(len(sight), 0.01), np.ones((len(sight), 1), bool), (0,))
+    begun = polish(Problem((photo,), (lamp,), SATIN, Unknowns(("K_lm",), direction=False)), steps=0)
+    assert not begun.converged and begun.estimate("K_lm").low is not None
+    told = as_far_as_known(begun)
+    assert told.estimate("K_lm").low is None and "did not settle" in told.statements[0]

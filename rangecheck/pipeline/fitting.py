@@ -165,7 +165,7 @@ def _told(
     fitted: Fitted, out: str | None, pictures: Sequence[str], force: bool, reporter: Reporter, camera: CameraFound | None,
     metal: Material | None = None,
 ) -> Outcome:  # fmt: skip
-    from rangecheck.recover.outcome import material_of, material_toml, with_what_is_taken
+    from rangecheck.recover.outcome import as_far_as_known, material_of, material_toml, with_what_is_taken
 
     assert out is not None
     unexplained = said_of_outliers(fitted)
@@ -174,7 +174,9 @@ def _told(
     except SceneError as refusal:
         # where the shape is another one, it is not the lamps' irradiance that is wrong
         raise SceneError(f"no material is found: {unexplained[0]}", **refusal.measured) from None if unexplained else refusal
-    fitted = with_what_is_taken(fitted, material, unexplained)
+    fitted = with_what_is_taken(as_far_as_known(fitted), material, unexplained)
+    if camera is not None and not fitted.converged:
+        camera = camera._replace(within_mm=None, turn_within_rad=None)
     names = ", ".join(Path(p).name for p in pictures)
     write_bytes(out, material_toml(material, fitted, f"fitted to {names}").encode(), force=force)
     lines = [f"{out}: residuals are {fitted.scale:.2f} times the noise, {100 * fitted.outliers:.1f} % of the pixels are outliers"]
@@ -188,8 +190,6 @@ def _told(
     lines += assumed
     lines[1:1] = unexplained
     lines += [f"not determined: {said}" for said in fitted.statements if said not in unexplained]
-    if not fitted.converged:
-        lines.append("the fit did not settle; give better guesses of the lights, or more pictures")
     content = document(
         "fit", output=out, estimates=[vars(e) for e in estimates], lights=lamps, not_determined=fitted.statements,
         world_from_camera=None if camera is None else camera.world_from_camera,

@@ -51,6 +51,17 @@ def material_of(fitted: Fitted, name: str = "fitted", metal: Material | None = N
     return material, said
 
 
+def as_far_as_known(fitted: Fitted) -> Fitted:
+    """The same, without intervals where the fit did not settle: they would be of a place at which it would not have stayed."""
+    if fitted.converged:
+        return fitted
+    estimates = [replace(e, low=None, high=None) for e in fitted.estimates]
+    said = (
+        "the fit did not settle, so that how well its numbers are known cannot be said; give better guesses, or more pictures",
+    )
+    return replace(fitted, estimates=estimates, determination=fitted.determination._replace(statements=said))
+
+
 def with_what_is_taken(fitted: Fitted, material: Material, said: Sequence[str] = ()) -> Fitted:
     """The fit with what `material` holds instead of strengths that the pictures do not determine, and with more that is to be said of it."""
     spike, lobe, both = (float(np.asarray(k)) for k in (material.K_ss, material.K_sl, material.K_s))
