@@ -203,6 +203,21 @@ def test_what_could_be_compared_is_told_apart_from_what_was_judged():
     least = np.full((10, 10), np.nan)
     least[:4] = 1.2
     least[0] = 0.8
-    found = SimpleNamespace(least_mm=least, judged=0.1, paint=0.02, grid=SimpleNamespace(valid=np.ones((10, 10), bool)))
+    excluded = {"saturated in the picture": 0.2, "in shadow": 0.0, "within 10 mm of those": 0.4}
+    grid = SimpleNamespace(valid=np.ones((10, 10), bool))
+    found = SimpleNamespace(least_mm=least, judged=0.1, excluded=excluded, paint=0.02, grid=grid)
     said = _judged_line("view", found)
     assert "10 % of it judged by its brightness to 1 mm, of 40 % that could be compared, where dents of 1.20 mm (median)" in said
+    assert said.endswith("; not compared: 20 % saturated in the picture, 40 % within 10 mm of those")
+
+
+def test_every_cell_is_compared_or_its_reason_is_told():
+    scan = ball_scan()
+    bright = scan.brightness.copy()
+    # a saturated stripe down the lit side
+    bright[:, 80:90] = 1.0
+    found = compare(replace(scan, brightness=bright))
+    compared = np.isfinite(found.least_mm).sum() / found.grid.valid.sum()
+    assert compared + sum(found.excluded.values()) == pytest.approx(1.0)
+    inside = found.grid.valid[:, 80:90].sum() / found.grid.valid.sum()
+    assert found.excluded["saturated in the picture"] == pytest.approx(inside, rel=0.3)

@@ -169,7 +169,7 @@ def _documents() -> dict[str, tuple[Any, ...]]:
     scans_checked = record(
         file=TEXT, kind=one_of("scans"), scans=many(ref("scan")), fit=FLAG, registration=or_null(ref("registration")), filtered=maybe(TEXTS),
         quality=or_null(ref("quality")), findings=many(ref("finding")),
-        pictures=many(record(name=TEXT, by=one_of("second picture", "shading", "none"), judged=NUMBER, least_mm=maybe(or_null(NUMBER)),
+        pictures=many(record(name=TEXT, by=one_of("second picture", "shading", "none"), judged=NUMBER, excluded=maybe(NUMBERS), least_mm=maybe(or_null(NUMBER)),
                              dents=maybe(many(record(radius_mm=NUMBER, judged=NUMBER))), paint=maybe(NUMBER), refused=maybe(TEXT), regions=regions)),
     )  # fmt: skip
     posed = record(picture=TEXT, world_from_camera=POSE)
@@ -291,7 +291,7 @@ def _documents() -> dict[str, tuple[Any, ...]]:
         "explained": (
             "`fit` of a scan to its own brightness",
             record(fit=FLAG, inputs=NAMES, seconds=NUMBERS,
-                   scans=many(record(name=TEXT, judged=NUMBER, paint=NUMBER, light_direction=POINT, light_distance_mm=NUMBER, material=by_name(ANYTHING),
+                   scans=many(record(name=TEXT, judged=NUMBER, excluded=NUMBERS, paint=NUMBER, light_direction=POINT, light_distance_mm=NUMBER, material=by_name(ANYTHING),
                                      not_determined=TEXTS, regions=regions))),
         ),
         "study": (

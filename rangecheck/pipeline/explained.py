@@ -114,6 +114,7 @@ def _by_shading(scan: RangeScan) -> tuple[dict[str, Any], tuple[Region, ...], li
         "judged": found.judged,
         "least_mm": float(np.median(known)) if known.size else None,
         "paint": found.paint,
+        "excluded": found.excluded,
     }
     return about, found.regions, [_judged_line(scan.name, found), *_places(found.regions, scan.world_from_scan, found.judged)]
 
@@ -122,15 +123,16 @@ def _judged_line(name: str, found: Comparison) -> str:
     known = found.least_mm[np.isfinite(found.least_mm)]
     compared = known.size / max(1, int(found.grid.valid.sum()))
     least = f"dents of {np.median(known):.2f} mm (median) would be named" if known.size else "nothing of it is lit well enough"
+    why = [f"{100 * share:.0f} % {reason}" for reason, share in found.excluded.items() if share >= _HARDLY]
+    rest = f"; not compared: {', '.join(why)}" if why else ""
     if found.judged < _HARDLY:
         return (
-            f"{name}: {100 * compared:.0f} % of it could be compared, the rest is too near to rims, shadows and gaps; there its brightness differs by "
-            f"{100 * found.paint:.1f} % from the scan's shading in structures of a dent's size (paint, or noise of the ranges), so that only {least}: its shape "
-            f"cannot be judged to {JUDGED_MM:g} mm by it"
+            f"{name}: {100 * compared:.0f} % of it could be compared{rest}; there its brightness differs by {100 * found.paint:.1f} % from the scan's shading in "
+            f"structures of a dent's size (paint, or noise of the ranges), so that only {least}: its shape cannot be judged to {JUDGED_MM:g} mm by it"
         )
     return (
         f"{name}: {100 * found.judged:.0f} % of it judged by its brightness to {JUDGED_MM:g} mm, of {100 * compared:.0f} % that could be compared, where {least}; "
-        "what is left of that has too much paint or noise of the ranges, the rest is too near to rims, shadows and gaps"
+        f"what is left of that has too much paint or noise of the ranges{rest}"
     )
 
 
@@ -206,6 +208,7 @@ def facts(found: Comparison) -> dict[str, Any]:
     light, material = found.fitted.problem.lights[0], found.fitted.problem.material
     return {
         "judged": found.judged,
+        "excluded": found.excluded,
         "paint": found.paint,
         "light_direction": light.direction,
         "light_distance_mm": light.distance_mm,

@@ -50,7 +50,7 @@ _FREEDOMS = (100.0, 50.0, 30.0, 20.0, 15.0, 12.0, 10.0)
 class Comparison:
     """regions, the worst first;  z (h, w) of the strongest template, NaN where nothing was compared;  hollow (h, w) that of the strongest dent: above 0 where the
     scan lies too deep;  amount_mm (h, w) of it;  least_mm (h, w) the dent that
-    would be named there;  residual (h, w) = ln(seen/predicted);  judged: share of the valid cells;  level: |z| from which a place is named;
+    would be named there;  residual (h, w) = ln(seen/predicted);  judged: share of the valid cells;  excluded: shares of them that were not compared, by why;  level: |z| from which a place is named;
     paint: spread of the residual in the scale of dents;  fitted;  grid"""
 
     regions: tuple[Region, ...]
@@ -60,6 +60,7 @@ class Comparison:
     least_mm: FloatArray
     residual: FloatArray
     judged: float
+    excluded: dict[str, float]
     level: float
     paint: float
     fitted: Fitted
@@ -124,8 +125,18 @@ def compare(scan: RangeScan, *, step: int = 1, scale_mm: float | None = None, fi
     regions += shadow_regions(shaded & ~cast, seen, judged, grid, filters.spread, radius_mm)
     regions = [replace(region, asked=level) for region in regions]
     share = float(judged.sum() / max(1, grid.valid.sum()))
+    full = keep & bright & ~shone
+    out = {
+        "seen too slantingly": grid.valid & ~keep,
+        "hardly lit": keep & ~bright,
+        "saturated in the picture": full,
+        "in shadow": shaded,
+    }
+    edge_mm = 2.0 * scale + 1.5 * radius_mm
+    out[f"within {edge_mm:.0f} mm of those, of rims and of gaps"] = shone & ~shaded & ~compared
+    excluded = {why: float(cells.sum() / max(1, grid.valid.sum())) for why, cells in out.items()}
     best, hollow, amount, least = (np.where(compared, v, np.nan) for v in (best, hollow, amount, least))
-    return Comparison(tuple(regions), best, hollow, amount, least, residual, share, level, filters.spread, fitted, grid)
+    return Comparison(tuple(regions), best, hollow, amount, least, residual, share, excluded, level, filters.spread, fitted, grid)
 
 
 def _shading_slopes(
