@@ -173,7 +173,9 @@ def _told(
         material, assumed = material_of(fitted, Path(out).stem, metal)
     except SceneError as refusal:
         # where the shape is another one, it is not the lamps' irradiance that is wrong
-        raise SceneError(f"no material is found: {unexplained[0]}", **refusal.measured) from None if unexplained else refusal
+        if not unexplained:
+            raise
+        raise SceneError(f"no material is found: {unexplained[0]}", **refusal.measured) from None
     fitted = with_what_is_taken(as_far_as_known(fitted), material, unexplained)
     if camera is not None and not fitted.converged:
         camera = camera._replace(within_mm=None, turn_within_rad=None)
