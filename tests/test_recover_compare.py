@@ -96,6 +96,11 @@ def test_the_picture_of_what_is_left_is_red_where_the_scan_lies_too_deep_and_blu
         assert not (shown[..., less] - shown[..., more] > 60).any()
     ringed, plain = (residual_picture(replace(dent, regions=regions), "ball") for regions in (dent.regions, ()))
     assert 100 < (ringed != plain).any(axis=2).sum() < 0.02 * plain[..., 0].size
+    # the ring is about the place's middle, wherever in it the worst cell is, and says what is wrong
+    [place] = dent.regions
+    beside = replace(place, cell=(place.cell[0] + 6, place.cell[1] - 6))
+    assert (residual_picture(replace(dent, regions=(beside,)), "ball") == ringed).all()
+    assert (residual_picture(replace(dent, regions=(replace(place, kind="albedo"),)), "ball") != ringed).any()
 
 
 def test_a_step_between_two_halves_of_a_scan_is_named_on_its_line(clean):

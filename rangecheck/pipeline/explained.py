@@ -72,8 +72,10 @@ def pictured(path: str | Path, scans: Sequence[Any], severities: Mapping[str, st
         wrong = [region for region in regions if region.kind in AGAINST_SHAPE]
         if wrong:
             places = rigid.move_points(scan.world_from_scan, np.array([region.middle_mm for region in wrong]))
-            kinds = " and ".join(f"{sum(r.kind == kind for r in wrong)} of {kind}" for kind in AGAINST_SHAPE)
-            message = f"{scan.name}: at {len(wrong)} places its shape is not what its picture shows ({kinds})"
+            counts = {kind: sum(r.kind == kind for r in wrong) for kind in AGAINST_SHAPE}
+            kinds = " and ".join(f"{count} of {kind}" for kind, count in counts.items() if count)
+            places_said = "one place" if len(wrong) == 1 else f"{len(wrong)} places"
+            message = f"{scan.name}: at {places_said} its shape is not what its picture shows ({kinds})"
             findings.append(
                 finding(_CODE, len(wrong), message, places, None, severities, kinds=[region.kind for region in wrong])
             )
@@ -130,9 +132,10 @@ def _judged_line(name: str, found: Comparison) -> str:
             f"{name}: {100 * compared:.0f} % of it could be compared{rest}; there its brightness differs by {100 * found.paint:.1f} % from the scan's shading in "
             f"structures of a dent's size (paint, or noise of the ranges), so that only {least}: its shape cannot be judged to {JUDGED_MM:g} mm by it"
         )
+    left = "; what is left of that has too much paint or noise of the ranges" if compared - found.judged >= _HARDLY else ""
     return (
-        f"{name}: {100 * found.judged:.0f} % of it judged by its brightness to {JUDGED_MM:g} mm, of {100 * compared:.0f} % that could be compared, where {least}; "
-        f"what is left of that has too much paint or noise of the ranges{rest}"
+        f"{name}: {100 * found.judged:.0f} % of it judged by its brightness to {JUDGED_MM:g} mm, of {100 * compared:.0f} % that could be compared, where "
+        f"{least}{left}{rest}"
     )
 
 
@@ -229,7 +232,7 @@ def told(scan: RangeScan, found: Comparison) -> list[str]:
 
 def residual_picture(found: Comparison, name: str) -> Picture:
     """(H, W, 3) uint8: z of the strongest false hollow in units of the level, over the scan's faded brightness where nothing was compared; places
-    that are named have a ring, and the number that they have in the list."""
+    that are named have a ring, and the number that they have in the list, with what they are."""
     from PIL import Image, ImageDraw
 
     valid = found.grid.valid
@@ -248,11 +251,20 @@ def residual_picture(found: Comparison, name: str) -> Picture:
     draw = ImageDraw.Draw(image)
     letters = font(letter_px(image.height))
     for k, region in enumerate(found.regions[:_TOLD]):
-        y, x = ((at - start.start + 0.5) * times for at, start in zip(region.cell, held))
+        y, x = ((at - start.start + 0.5) * times for at, start in zip(_cell_of(region, found), held))
         reach = times * (0.5 * region.length_mm / found.grid.spacing_mm + 4.0)
         draw.ellipse((x - reach, y - reach, x + reach, y + reach), outline=INK, width=2)
-        draw.text(
-            (x + 0.8 * reach, y - 0.8 * reach), str(k + 1), font=letters, fill=INK, anchor="lb", stroke_width=2, stroke_fill=PAPER
-        )
+        said = f"{k + 1} {region.kind}"
+        wide, high = draw.textbbox((0, 0), said, font=letters)[2:]
+        # beside the ring, and inside the picture
+        right, up = min(x + 0.8 * reach, image.width - wide - 4.0), max(y - 0.8 * reach, high + 4.0)
+        draw.text((right, up), said, font=letters, fill=INK, anchor="lb", stroke_width=2, stroke_fill=PAPER)
     scale = ColourScale(-_SPAN, _SPAN, f"{found.level:.1f} sigma", "RdBu_r", (-1.0, 1.0))
     return framed(np.asarray(image), f"{name}: shape against brightness", _MEANS, scale)
+
+
+def _cell_of(region: Region, found: Comparison) -> tuple[int, int]:
+    """The cell nearest to a place's middle."""
+    away = np.linalg.norm(found.grid.points - region.middle_mm, axis=-1)
+    row, column = np.unravel_index(int(np.nanargmin(away)), away.shape)
+    return int(row), int(column)
