@@ -3,9 +3,10 @@
 The unknowns are q = ln range of the valid cells of a grid. Brightness is held against the shading of the slopes of cells and of those halfway between two
 linked cells: a cell's own slopes, being means over two links, say nothing of heights that alternate. Bends hide from a cell what happens within it: of
 standard deviation s a cell they make slopes that walk at random, and the mean of such a slope over a pixel, which the picture has, and that over the two cells
-of a central difference are s / sqrt(24) apart, as are those over a link and over its two pixels. A bend of many standard deviations is a kink, and weighs as
-little as it is likely: strands of hair and creases then keep their edges, and what lies beside them stays as smooth as it is (Black and Rangarajan, *On the
-unification of line processes, outlier rejection, and robust statistics*, 1996).
+of a central difference are s / sqrt(24) apart, as are those over a link and over its two pixels. Cells at which surfaces end, with no bend to either side,
+hide no less. Where a surface faces the lamp its brightness hardly changes with slope, and what is hidden is of second order. A bend of many standard
+deviations is a kink, and weighs as little as it is likely: strands of hair and creases then keep their edges, and what lies beside them stays as smooth as it
+is (Black and Rangarajan, *On the unification of line processes, outlier rejection, and robust statistics*, 1996).
 """
 
 from __future__ import annotations
@@ -108,12 +109,14 @@ class Balance:
     def look(self, q: FloatArray, slopes: Slopes, shading: Shading, ends: IntArray, share: float) -> Look:
         """What the picture shows of `slopes`, as far as heights `q` tell how much bends within a cell, or within a link, hide of it."""
         normals, slope_u, slope_v = slopes.normals(q)
-        _, by_normal = shading.at(normals)
-        unit = np.zeros(len(q))
-        unit[self.heights.bend_cell] = self.bend_unit
+        value, by_normal = shading.at(normals)
+        unit = self.heights.spacing * np.exp(self.measured)
         bends = _MISSED * (self.curvature * unit)[self.heights.inner] * np.where(self.heights.whole, 1.0, _RIM)
+        hidden = bends[ends].mean(axis=1)
         by_slope = np.hypot((by_normal * slope_u).sum(1), (by_normal * slope_v).sum(1))
-        return Look(slopes, shading, ends, bends[ends].mean(axis=1) * by_slope, share)
+        # a normal that turns by a and b takes (a^2 + b^2) / 2 of the brightness away: where both are alike and Gaussian (<a^2> + <b^2>) / sqrt(2), root mean square
+        squared = hidden**2 * ((slope_u**2).sum(1) + (slope_v**2).sum(1))
+        return Look(slopes, shading, ends, np.hypot(hidden * by_slope, np.sqrt(0.5) * value * squared), share)
 
     def with_picture(self, q: FloatArray, looks: Sequence[Look], believed: BoolArray, noise: FloatArray) -> FloatArray:
         """Gauss-Newton from `q` with what the looks show of believed cells (m,), whose brightness has `noise` (m,)."""

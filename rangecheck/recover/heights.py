@@ -18,6 +18,9 @@ import scipy.sparse as sparse
 
 from rangecheck.arrays import BoolArray, FloatArray, IntArray, unit_vectors
 
+#: of a step that is a tear, the part that is one beside a tear: edges go on, and two deviations, not three, tell them there
+_GOING_ON = 2.0 / 3.0
+
 
 @dataclass(frozen=True, eq=False)
 class Slopes:
@@ -88,7 +91,7 @@ def height_grid(
     """Of ranges (h, w), NaN where nothing returned, and unit rays (h, w, 3).
 
     Neighbours are linked unless ln range changes by more than `steepest` times the angle between their rays, plus `slack` (share of range), or by more than
-    the links before and after it do, the same way, by `torn` (share of range)."""
+    the links before and after it do, the same way, by `torn` (share of range), or by two thirds of it beside one that does."""
     valid = np.isfinite(range_mm)
     h, w = range_mm.shape
     n = int(valid.sum())
@@ -97,7 +100,7 @@ def height_grid(
     q = np.log(np.where(valid, range_mm, 1.0))
     loose = np.broadcast_to(slack, (h, w))
     linked = [_linked(q, valid, rays, steepest, loose, axis) for axis in (1, 0)]
-    linked = [whole & ~_torn(q, whole, np.broadcast_to(torn, (h, w)), axis) for whole, axis in zip(linked, (1, 0), strict=True)]
+    linked = [whole & ~_edges(q, whole, np.broadcast_to(torn, (h, w)), axis) for whole, axis in zip(linked, (1, 0), strict=True)]
     right, down = np.zeros((h, w), bool), np.zeros((h, w), bool)
     right[:, :-1], down[:-1] = linked
     left, up = np.zeros((h, w), bool), np.zeros((h, w), bool)
@@ -168,6 +171,15 @@ def height_grid(
         spacing,
         (h, w),
     )
+
+
+def _edges(q: FloatArray, linked: BoolArray, torn: FloatArray, axis: int) -> BoolArray:
+    """Links torn by more than `torn`, and those that go on from them to the sides by more than `_GOING_ON` of it (Canny, *A computational approach to edge
+    detection*, 1986)."""
+    from scipy.ndimage import binary_propagation
+
+    begun = _torn(q, linked, torn, axis)
+    return np.asarray(binary_propagation(begun, np.ones((3, 3), bool), mask=begun | _torn(q, linked, _GOING_ON * torn, axis)))
 
 
 def _torn(q: FloatArray, linked: BoolArray, torn: FloatArray, axis: int) -> BoolArray:

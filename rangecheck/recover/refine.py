@@ -59,7 +59,7 @@ _DOUBT_SIGMAS, _DOUBT_ENERGY = 4.0, 2.2
 #: share of the brightness that lamp and albedo leave uncertain
 _LAMP = 0.01
 #: slope, as change of range by distance across, and deviations of noise above it, up to which neighbours are linked; deviations of the difference of two
-#: steps from which one that is steeper than both its neighbours is a tear
+#: steps from which one that is steeper than both its neighbours is a tear, two thirds of them beside another
 _STEEPEST, _STEP_SIGMAS, _TORN_SIGMAS = 5.7, 4.0, 3.0
 #: deviations by which a cell is too bright for its slope, and those of steps from which one beside such a cell is a tear
 _BRIGHTER, _TORN_SIGMAS_FLAT = 3.0, 0.5
@@ -131,11 +131,12 @@ def refine(scan: RangeScan, *, fitted: Fitted | None = None, noise_mm: float | N
     # a lamp and an albedo are not known better than a few per cent
     noise_seen = known = np.hypot(spread, _LAMP * shading.seen)
     shading = replace(shading, seen=shading.seen / albedo)
-    looks = [
-        model.look(q, heights.slopes, shading, np.arange(len(albedo))[:, None], _OWN_SHARE),
-        model.look(q, heights.between, shading.between(heights.ends), heights.ends, _LINK_SHARE),
-    ]
     for _ in range(_DOUBTS):
+        # as the slopes come nearer to the truth, so does what bends hide of them
+        looks = [
+            model.look(q, heights.slopes, shading, np.arange(len(albedo))[:, None], _OWN_SHARE),
+            model.look(q, heights.between, shading.between(heights.ends), heights.ends, _LINK_SHARE),
+        ]
         q = model.with_picture(q, looks, believed, noise_seen)
         # where picture and range cannot both be right within their noise the picture is believed less: folds as narrow as cells, rims of paint
         doubted = model.strained(q, _DOUBT_SIGMAS, _DOUBT_ENERGY)[heights.inner] & believed
