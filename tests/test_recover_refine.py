@@ -144,6 +144,19 @@ def test_a_tear_goes_on_where_its_step_becomes_lower():
         assert (8 * 6 + 4, 8 * 6 + 5) in linked and (8 * 5 + 3, 8 * 6 + 3) in linked
 
 
+def test_stairs_are_no_slope_where_their_cells_are_told_to_be_flat():
+    """Strands as narrow as cells: step by step they are alike, and to the ranges one steep slope."""
+    noise, column = 0.2 / 500.0, np.arange(8)
+    ranges = 500.0 * np.exp(np.clip(column - 2, 0, 3) * 2.5 / 500.0 * np.ones((8, 1)))
+    told = (np.arange(8)[:, None] < 4) & (column > 1) & (column < 5)
+    heights = height_grid(ranges, straight_ahead(8), np.where(told, 1.0, 5.7), 4.0 * noise, 3.0 * np.sqrt(6.0) * noise)
+    parted = np.ones((8, 7), bool)
+    first, second = heights.cell[heights.inner[heights.ends]].T
+    parted.reshape(-1)[(first // 8 * 7 + first % 8)[second - first == 1]] = False
+    # the last step, down to a cell of which nothing is told, is left alone and so a tear
+    assert parted[:4, 2:5].all() and not parted[:4, :2].any() and not parted[4:].any()
+
+
 def test_what_bends_hide_is_how_far_brightness_is_off_where_slopes_are(clean):
     """Of cells that face the lamp, of slanted ones and of those at which the ball ends, which have no bend of their own."""
     scan, _, _, out = clean
@@ -375,7 +388,6 @@ def test_a_refined_scan_is_taken_to_err_by_no_less_than_its_readings(clean):
         settings = load_settings(None, [f"scan.refine={str(name).lower()}"])
         ready = prepared([clean[0]], settings, Reporter(), quality=True)
         told[name] = ready.quality["views"][0]
-    for said in ("noise_mm", "error_mm", "spacing_mm"):
-        assert told[True][said] == told[False][said]
+    assert told[True]["noise_mm"] < 0.7 * told[False]["noise_mm"]  # what neighbours show of it
     assert told[True]["stated_noise_mm"] == pytest.approx(told[False]["noise_mm"], rel=0.15)
     assert ready.grids[0].noise_mm == pytest.approx(told[False]["noise_mm"], rel=0.15)  # by which edges are cut and vertices err

@@ -86,11 +86,15 @@ class HeightGrid:
 
 
 def height_grid(
-    range_mm: FloatArray, rays: FloatArray, steepest: float, slack: FloatArray | float, torn: float = np.inf
+    range_mm: FloatArray,
+    rays: FloatArray,
+    steepest: FloatArray | float,
+    slack: FloatArray | float,
+    torn: FloatArray | float = np.inf,
 ) -> HeightGrid:
     """Of ranges (h, w), NaN where nothing returned, and unit rays (h, w, 3).
 
-    Neighbours are linked unless ln range changes by more than `steepest` times the angle between their rays, plus `slack` (share of range), or by more than
+    Neighbours are linked unless ln range changes by more than `steepest`, of either, times the angle between their rays, plus `slack` (share of range), or by more than
     the links before and after it do, the same way, by `torn` (share of range), or by two thirds of it beside one that does."""
     valid = np.isfinite(range_mm)
     h, w = range_mm.shape
@@ -98,8 +102,8 @@ def height_grid(
     number = np.full((h, w), -1)
     number[valid] = np.arange(n)
     q = np.log(np.where(valid, range_mm, 1.0))
-    loose = np.broadcast_to(slack, (h, w))
-    linked = [_linked(q, valid, rays, steepest, loose, axis) for axis in (1, 0)]
+    steep, loose = np.broadcast_to(steepest, (h, w)), np.broadcast_to(slack, (h, w))
+    linked = [_linked(q, valid, rays, steep, loose, axis) for axis in (1, 0)]
     linked = [whole & ~_edges(q, whole, np.broadcast_to(torn, (h, w)), axis) for whole, axis in zip(linked, (1, 0), strict=True)]
     right, down = np.zeros((h, w), bool), np.zeros((h, w), bool)
     right[:, :-1], down[:-1] = linked
@@ -202,10 +206,11 @@ def _rows(values: FloatArray, row: IntArray, column: IntArray, shape: tuple[int,
     return sparse.csr_array(sparse.coo_array((values, (row, column)), shape=shape))
 
 
-def _linked(q: FloatArray, valid: BoolArray, rays: FloatArray, steepest: float, slack: FloatArray, axis: int) -> BoolArray:
+def _linked(q: FloatArray, valid: BoolArray, rays: FloatArray, steepest: FloatArray, slack: FloatArray, axis: int) -> BoolArray:
     """(h, w-1) or (h-1, w): whether neighbours along the axis lie on one surface."""
     ahead, behind = [slice(None)] * 2, [slice(None)] * 2
     ahead[axis], behind[axis] = slice(1, None), slice(None, -1)
     a, b = tuple(ahead), tuple(behind)
     apart = np.linalg.norm(rays[a] - rays[b], axis=-1)
-    return np.asarray(valid[a] & valid[b] & (np.abs(q[a] - q[b]) < steepest * apart + slack[a]))
+    most = np.maximum(steepest[a], steepest[b]) * apart + slack[a]
+    return np.asarray(valid[a] & valid[b] & (np.abs(q[a] - q[b]) < most))

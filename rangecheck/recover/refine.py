@@ -10,9 +10,9 @@ Gauss-Newton with the exact derivative of the shading by the slopes; the picture
 
 bend_sd is taken per place, the smallest for which range minus heights stays noise when averaged over a few cells: where more would be taken
 away than noise can be, the surface is let bend more (Lepskii's rule). Noise of neighbours must be independent. A step between neighbours that is steeper than
-those beside it by more than noise is an edge across which nothing is smoothed, and the sooner where the picture shows its cells too bright for a slope. At
-last the heights are held against the ranges once more: where more was taken away than their noise lets expect, part of it is given back (Stein's unbiased
-estimate of the error, which needs no truth).
+those beside it by more than noise is an edge across which nothing is smoothed, and the sooner where the picture shows its cells too bright for a slope; two
+such cells are parted by any step that is steep. At last the heights are held against the ranges once more: where more was taken away than their noise lets
+expect, part of it is given back (Stein's unbiased estimate of the error, which needs no truth).
 
 Albedo and shape cannot be told apart by one picture at fine scale, but at coarse scale the range tells the shape: where the brightness, averaged,
 differs from what the range's own shape predicts, the surface is painted, and the picture is not used there (each cell's difference is bounded, so that
@@ -61,8 +61,9 @@ _LAMP = 0.01
 #: slope, as change of range by distance across, and deviations of noise above it, up to which neighbours are linked; deviations of the difference of two
 #: steps from which one that is steeper than both its neighbours is a tear, two thirds of them beside another
 _STEEPEST, _STEP_SIGMAS, _TORN_SIGMAS = 5.7, 4.0, 3.0
-#: deviations by which a cell is too bright for its slope, and those of steps from which one beside such a cell is a tear
-_BRIGHTER, _TORN_SIGMAS_FLAT = 3.0, 0.5
+#: deviations by which a cell is too bright for its slope, those of steps from which one beside such a cell is a tear, and the slope above which two such
+#: cells are not linked: stairs of strands as narrow as cells look like one slope to the ranges
+_BRIGHTER, _TORN_SIGMAS_FLAT, _STEEPEST_FLAT = 3.0, 0.5, 1.0
 #: noise of slanted cells that is believed, in that of cells seen face on, at slants over seven cells; cells over which the refined surface's own slant is
 #: averaged
 _SLANTED, _OWN_SLANT = 1.25, 3.0
@@ -179,7 +180,8 @@ def _heights(scan: RangeScan, grid: ScanGrid, noise: FloatArray, flat: BoolArray
     share = noise / np.nan_to_num(scan.range_mm, nan=1.0)
     sigmas = _TORN_SIGMAS if flat is None else np.where(flat, _TORN_SIGMAS_FLAT, _TORN_SIGMAS)
     torn = sigmas * np.sqrt(6.0) * share
-    return height_grid(ranges, grid.rays, _STEEPEST, _STEP_SIGMAS * share, torn)
+    steepest = _STEEPEST if flat is None else np.where(flat, _STEEPEST_FLAT, _STEEPEST)
+    return height_grid(ranges, grid.rays, steepest, _STEP_SIGMAS * share, torn)
 
 
 def _noise(scan: RangeScan, noise_mm: float | None) -> FloatArray:

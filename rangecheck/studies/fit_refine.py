@@ -28,7 +28,7 @@ from rangecheck.study import Line, LineChart
 #: share of light that the bust gives back, and noise of its picture
 ALBEDO, PICTURE_NOISE = 0.7, 0.01
 _WINDOW = 16
-_FRESH = 99400
+_FRESH = 99700
 
 
 def bust_picture(azimuth_deg: float, seed: int, *, spots: int = 0, step: int = 1) -> tuple[SimulatedScan, RangeScan]:
