@@ -131,6 +131,12 @@ def read_toml(path: str | Path) -> dict[str, Any]:
         raise InputError(path, f"is not valid TOML ({' '.join(str(error).split())}); correct it and try again") from None
 
 
+def beside(name: str, folder: str | Path) -> str:
+    """A file by its name, as a file in `folder` has it: from where the program runs, else in that folder; as it is where it is in neither."""
+    there = Path(folder) / name
+    return str(there) if not Path(name).is_file() and there.is_file() else name
+
+
 def read_bytes(path: str | Path, limit: int | None = None) -> bytes:
     """The file's bytes (at most `limit`). Raises InputError in one line when it is missing, a folder, or unreadable."""
     path = Path(path)

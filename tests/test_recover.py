@@ -11,7 +11,7 @@ from rangecheck.errors import SceneError, SettingError
 from rangecheck.optics import PinholeCamera
 from rangecheck.recover.fit import fit
 from rangecheck.recover.lights import ONE_NODE, SEVEN_NODES, Light, tangents
-from rangecheck.recover.polish import polish
+from rangecheck.recover.polish import in_own_unit, polish
 from rangecheck.recover.problem import Guess, Photograph, Problem, Unknowns
 from rangecheck.recover.sight import lit_by, see, sphere_sight
 from rangecheck.reflectance import Material
@@ -287,3 +287,10 @@ def test_a_fit_without_unknowns_or_pixels_says_what_it_lacks():
         Unknowns(("roughness",))
     with pytest.raises(SceneError, match="radius is 1"):
         sphere_sight((5, 5), 1, (10, 10))
+
+
+def test_an_interval_of_what_nothing_determines_is_a_number_still():
+    sight = sphere_sight((20, 20), 18, (40, 40))
+    problem = problem_on(sight, (Light(np.array([0.0, 0.0, 1.0]), 2.0, np.zeros(3), 1e6),), Guess(), Unknowns())
+    [length] = [p for p in problem.parameters() if p.name == "sigma_um"]
+    assert in_own_unit(problem, length, 5000.0) > 1e100 and in_own_unit(problem, length, -5000.0) == 0.0

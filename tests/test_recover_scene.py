@@ -240,3 +240,9 @@ def test_a_job_s_file_finds_its_material_beside_itself(tmp_path):
     (tmp_path / "satin.toml").write_text(SATIN)
     (tmp_path / "job.toml").write_text('[light]\nmaterials = ["satin.toml", "steel", "nowhere.toml"]\n')
     assert load_settings(tmp_path / "job.toml").light.materials == (str(tmp_path / "satin.toml"), "steel", "nowhere.toml")
+
+
+def test_a_scene_s_file_finds_its_material_beside_itself(tmp_path):
+    (tmp_path / "satin.toml").write_text(SATIN)
+    scene = ball_and_block(tmp_path, "satin.toml", "brass")
+    assert exit_status(["render", scene, "-o", str(tmp_path / "seen.png"), "--size", "32x24", "-q"]) == 0

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ValidationError
 
 from rangecheck.config.schema import Settings
 from rangecheck.errors import InputError, SettingError
-from rangecheck.files import presets_folder, read_bytes
+from rangecheck.files import beside, presets_folder, read_bytes
 
 
 def load_settings(
@@ -66,15 +66,10 @@ def _read(file: str | Path) -> dict[str, Any]:
         raise InputError(path, f"is not valid TOML ({error}); correct it and try again") from None
     light = tree.get("light")
     if isinstance(light, dict) and isinstance(light.get("materials"), list):
-        light["materials"] = [_beside(path, name) for name in light["materials"]]
+        light["materials"] = [
+            beside(name, path.parent) if isinstance(name, str) and name.endswith(".toml") else name for name in light["materials"]
+        ]
     return tree
-
-
-def _beside(settings: Path, name: Any) -> Any:
-    """A material's file as the settings' file has it: from where the command runs, else beside the settings."""
-    if not isinstance(name, str) or not name.endswith(".toml") or Path(name).is_file():
-        return name
-    return str(settings.parent / name) if (settings.parent / name).is_file() else name
 
 
 def _value(text: str) -> Any:

@@ -9,7 +9,7 @@
     size_mm = [60, 40, 30]
     at_mm = [0, 20, 0]             # where its origin goes, after
     turn_deg = [0, 30, 0]          # turning about x, then y, then z
-    material = "plaster"
+    material = "plaster"           # or a material's file, from where the program runs or beside this one
 
 Booleans hold their operands in `of`, a list of the same tables, and difference takes all others from the first. World frame: y up.
 Frames of the shapes: `primitives`. A plane is a sheet that faces up; within a boolean it is the block of matter below it.
@@ -29,7 +29,7 @@ import numpy as np
 from rangecheck import rigid
 from rangecheck.arrays import FloatArray
 from rangecheck.errors import SceneError, told_of
-from rangecheck.files import read_toml
+from rangecheck.files import beside, read_toml
 from rangecheck.modeler import primitives
 from rangecheck.modeler.body import Body
 from rangecheck.modeler.engine import OPERATIONS, combine, common_volume_mm3
@@ -131,6 +131,8 @@ class _Builder:
         material = row.get("material", "")
         if not isinstance(material, str):
             raise SceneError(f"{path}: material is {material!r}; it must be a name")
+        if material.endswith(".toml") and self.folder is not None:
+            material = beside(material, self.folder)
         # the innermost word counts: an operand may be of another material than the whole
         return made.moved(_placement(row, path)), tuple(m or material for m in materials), closed
 

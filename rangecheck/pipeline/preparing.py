@@ -61,11 +61,16 @@ def prepared(
     grids, filtered = _filtered(grids, settings, reporter)
     done: list[Any] = []
     refining: list[dict[str, Any]] = []
+    before: dict[str, Samples] = {}
     if settings.scan.refine:
         from rangecheck.pipeline.refining import refined_scans
 
-        # what errs in refined ranges neighbours share, and no longer show: they are taken to err by no less than before
+        # what errs in refined ranges neighbours share, and no longer show: they are taken to err by no less than before, and are worth as much
         grids = _with_noise(grids, reporter)
+        if quality:
+            before = dict(
+                zip([grid.name for grid in grids], in_chunks(lambda i, _: samples_of(grids[i]), len(grids), 1), strict=True)
+            )
         grids, done, refining = (shaped := refined_scans(grids, reporter)).scans, shaped.done, shaped.facts
     wanted = settings.scan.registration
     if clouds and wanted not in ("auto", "off"):
@@ -85,6 +90,8 @@ def prepared(
     worth = None
     if quality:
         known = None if report and report["left_out"] else samples
+        if before:
+            known = [before[grid.name] for grid in grids]
         if aside is None:
             facts, lines = _worth(grids, known, settings, reporter)
         else:

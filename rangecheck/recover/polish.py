@@ -22,6 +22,8 @@ TWO_SIDED_95 = 1.959963984540054
 _POLISH, _SETTLED, _LITTLE = 25, 0.03, 0.01
 #: what is known of a combination that nothing fixes: it lies within ten units
 HOLD = 0.01
+#: an interval of what nothing determines ends nowhere, but numbers do
+_LARGEST_LOG = 300.0
 #: the least of one minus a pixel's leverage
 _LEAST_LEFT = 1e-3
 
@@ -226,7 +228,7 @@ def in_own_unit(problem: Problem, p: Parameter, theta: float) -> float:
             base = problem.photographs[p.owner].exposure
         case _:
             return theta
-    return float(base * math.exp(theta))
+    return float(base * math.exp(min(theta, _LARGEST_LOG)))
 
 
 def estimate_of(
