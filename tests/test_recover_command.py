@@ -170,7 +170,9 @@ def test_lamps_are_calibrated_on_the_bust_itself_and_the_list_serves_where_lamps
     seen = ["--on", str(tmp_path / "ball.ply"), "--unit", "mm", "--camera", "100,80,400", "--field", "16", "--noise", "0.005"]
     capsys.readouterr()
     assert exit_status(["fit", *pictures, *seen, "--calibrate", "bust", "-o", str(tmp_path / "lamps.txt"), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
+    written = capsys.readouterr()
+    assert "what the surface's parts throw on each other is followed only in a scene" in written.err
+    found = json.loads(written.out)
     assert found["kind"] == "bust" and found["converged"] and found["residual_in_noises"] < 1.1
     truth = towards / np.linalg.norm(towards, axis=1, keepdims=True)
     off = np.degrees(np.arccos(np.clip((np.array(found["directions"]) * truth).sum(1), -1.0, 1.0)))

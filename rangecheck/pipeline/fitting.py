@@ -118,6 +118,10 @@ def fit(
     problem = Problem(taken, lamps, Guess(), Unknowns(names, one_camera=True, **free), nodes)
     from rangecheck.recover.fit import fit as solve
 
+    if look is not None:
+        reporter.note(
+            "light is taken to come straight from the lamps; what the surface's parts throw on each other is followed only in a scene whose file has its lamps"
+        )
     with reporter.stage("fitting"):
         fitted, found = (solve(problem, known_noise=False), None) if look is None else fit_looking(problem, look)
     if calibrate is not None:
