@@ -11,6 +11,9 @@ from pathlib import Path
 import hypothesis
 import pytest
 
+# as the command has it: two workers' threads would wait for each other over small matrices
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 # how long an example takes says something of the machine, not of the code
 hypothesis.settings.register_profile("any machine", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow])
 hypothesis.settings.load_profile("any machine")
