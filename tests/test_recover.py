@@ -9,8 +9,10 @@ from test_transport import ball
 from rangecheck import rigid
 from rangecheck.errors import SceneError, SettingError
 from rangecheck.optics import PinholeCamera
+from rangecheck.raycast import EmbreeCaster
 from rangecheck.recover.fit import fit
 from rangecheck.recover.lights import ONE_NODE, SEVEN_NODES, Light, tangents
+from rangecheck.recover.looks import Look, brought_over
 from rangecheck.recover.polish import in_own_unit, polish
 from rangecheck.recover.problem import Guess, Photograph, Problem, Unknowns
 from rangecheck.recover.sight import lit_by, see, sphere_sight
@@ -82,6 +84,23 @@ def bumpy_ball():
     surface = ball(3, 50.0)
     wave = 1 + 0.05 * np.sin(surface.vertices @ [0.1, 0.07, 0.05])
     return replace(surface, vertices=surface.vertices * wave[:, None])
+
+
+def test_a_camera_that_looks_past_the_object_is_shifted_until_the_model_lies_on_the_picture():
+    surface, camera = bumpy_ball(), PinholeCamera.from_field_of_view(56, 56, 16.0)
+    middle, pose = surface.bounds_mm.mean(axis=0), np.array(rigid.look_at((100, 80, 400.0), surface.bounds_mm.mean(axis=0)))
+    light = Light(np.array([-0.4, 0.5, 0.8]), 2.0, middle, 1e6, 0.25)
+    scene = Scene(surface, (Material("grey", K_lm=0.4, wavelengths_um=(0.555,)),), sources=(light.source(),), smooth=True)
+    seen = np.nan_to_num(Tracer(scene).render(camera, pose, DIRECT).radiance[..., 0])
+    # what is beside the object is bright, and says nothing
+    seen[seen == 0.0] = 0.3
+    past = pose.copy()
+    past[:3, 3] += 9.0 * pose[:3, 0] - 5.0 * pose[:3, 1]
+    look = Look(scene, EmbreeCaster(surface.vertices, surface.faces), camera, past, [seen], 0.01)
+    problem = problem_on(look.see(), (light,), Guess(0.3, 0.0, 0.0), Unknowns(("K_lm",), direction=False, pose=True))
+    problem = brought_over(look.at(problem, problem), look)
+    a_pixel = 2.0 * 413.0 * np.tan(np.radians(8.0)) / 56
+    assert np.abs((look.pose - pose)[:3, 3]).max() < a_pixel and len(problem.photographs[0].sight)
 
 
 @pytest.mark.parametrize("pivot", [None, (5.0, -3.0, 2.0)], ids=["about the camera", "about a pivot"])

@@ -1,7 +1,7 @@
 """A fit to photographs of a known shape: what a pixel sees of it changes with the camera's pose, and shadows change with the lamps.
 
 While numbers are moved, both are held (`sight`). So steps and looks - rays from where the camera is now known to stand, shadows of the lamps as now known -
-take turns. A pose is first found roughly, on few pixels with as much noise as what does not fit: while the picture does not lie on the shape, it says little
+take turns. A camera is first shifted until the model lies on the picture, then found roughly, on few pixels with as much noise as what does not fit: while the picture does not lie on the shape, it says little
 of lobes. Then all starts are tried again; the best is followed, a few steps a look, until the pose stands still beside its own uncertainty, and
 the last look is fitted with all pixels. World frame, millimetres.
 """
@@ -34,6 +34,8 @@ _LEAST_COSINE = 0.3
 _TILTS = 2.0
 #: the most looks, and steps of each;  a pose that moved by less than this share of its standard deviations stands still
 _LOOKS, _STEPS, _STILL = 20, 3, 0.2
+#: how often a camera is shifted until the model lies on the picture, and how far at most, in the picture's size
+_BROUGHT, _FARTHEST_SHIFT = 2, 0.1
 #: pixels that a rough look has about
 _ROUGH = 16000
 #: cosine of the angle by which lamps may turn before all starts are tried again, under their new shadows
@@ -150,6 +152,8 @@ def fit_looking(problem: Problem, look: Look) -> tuple[Fitted, CameraFound | Non
     step = max(1, round(math.sqrt(max(len(photo.sight) for photo in problem.photographs) / _ROUGH)))
     state = problem
     if pose:
+        for _ in range(_BROUGHT):
+            problem = brought_over(problem, look)
         state = _walked(problem, explored(_widened(with_best_strengths(problem)))[0], look, step, roughly=True)
     states = [state]
     for _ in range(_LOOKS):
@@ -164,6 +168,36 @@ def fit_looking(problem: Problem, look: Look) -> tuple[Fitted, CameraFound | Non
     fitted = settled(problem, [f.problem for f in followed(problem, [state, *states[1:]])], known_noise=False)
     _moved(look, fitted)
     return fitted, camera_found(fitted, look) if pose else None
+
+
+def brought_over(problem: Problem, look: Look) -> Problem:
+    """The problem where `look` is shifted across its view so that what the model shows lies on the pictures: what a step finds is within some pixels only.
+
+    Where the pixels of the shape are most alike but for a factor, of all whole shifts at once by Fourier transforms; what is beside the shape is anybody's."""
+    from scipy.signal import fftconvolve
+
+    state = with_best_strengths(problem)
+    alike = np.zeros(())
+    for k, photo in enumerate(state.photographs):
+        mask = photo.sight.spread((photo.noise < UNTOLD).astype(float), 0.0)[::-1, ::-1]
+        shown = np.minimum(
+            photo.sight.spread(state.predict(state.start(), k, slopes=False).values, 0.0)[::-1, ::-1], photo.saturation
+        )
+        seen = np.nan_to_num(look.pictures[k])
+        power = fftconvolve(seen**2, mask)
+        # what is nearly black resembles nothing
+        power = np.maximum(power, 0.1 * power.max()) * max(float((shown**2 * mask).sum()), 1e-30)
+        alike = alike + np.maximum(fftconvolve(seen, shown * mask), 0.0) ** 2 / power
+    height, width = state.photographs[0].sight.shape
+    most = round(_FARTHEST_SHIFT * max(height, width))
+    near = alike[max(height - 1 - most, 0) : height + most, max(width - 1 - most, 0) : width + most]
+    row, column = np.unravel_index(int(np.argmax(near)), near.shape)
+    down, right = row - min(most, height - 1), column - min(most, width - 1)
+    depth = float(np.median((state.photographs[0].sight.points - look.pose[:3, 3]) @ look.pose[:3, 2]))
+    camera = look.camera
+    across = right * depth / camera.fx * look.pose[:3, 0] + down * depth / camera.fy * look.pose[:3, 1]
+    look.move(np.concatenate([np.zeros(3), -across]))
+    return look.at(problem, problem)
 
 
 def _walked(problem: Problem, state: Problem, look: Look, step: int, *, roughly: bool = False) -> Problem:
