@@ -92,11 +92,13 @@ def test_a_camera_that_looks_past_the_object_is_shifted_until_the_model_lies_on_
     light = Light(np.array([-0.4, 0.5, 0.8]), 2.0, middle, 1e6, 0.25)
     scene = Scene(surface, (Material("grey", K_lm=0.4, wavelengths_um=(0.555,)),), sources=(light.source(),), smooth=True)
     seen = np.nan_to_num(Tracer(scene).render(camera, pose, DIRECT).radiance[..., 0])
-    # what is beside the object is bright, and says nothing
-    seen[seen == 0.0] = 0.3
-    past = pose.copy()
+    caster, past = EmbreeCaster(surface.vertices, surface.faces), pose.copy()
+    # what is beside the object is as bright as the object is on average, and says nothing
+    beside = np.ones(seen.size, bool)
+    beside[see(scene, camera, pose, caster).pixel] = False
+    seen[beside.reshape(seen.shape)] = 0.1
     past[:3, 3] += 9.0 * pose[:3, 0] - 5.0 * pose[:3, 1]
-    look = Look(scene, EmbreeCaster(surface.vertices, surface.faces), camera, past, [seen], 0.01)
+    look = Look(scene, caster, camera, past, [seen], 0.01)
     problem = problem_on(look.see(), (light,), Guess(0.3, 0.0, 0.0), Unknowns(("K_lm",), direction=False, pose=True))
     problem = brought_over(look.at(problem, problem), look)
     a_pixel = 2.0 * 413.0 * np.tan(np.radians(8.0)) / 56

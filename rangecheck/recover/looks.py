@@ -1,9 +1,9 @@
 """A fit to photographs of a known shape: what a pixel sees of it changes with the camera's pose, and shadows change with the lamps.
 
 While numbers are moved, both are held (`sight`). So steps and looks - rays from where the camera is now known to stand, shadows of the lamps as now known -
-take turns. A camera is first shifted until the model lies on the picture, then found roughly, on few pixels with as much noise as what does not fit: while the picture does not lie on the shape, it says little
-of lobes. Then all starts are tried again; the best is followed, a few steps a look, until the pose stands still beside its own uncertainty, and
-the last look is fitted with all pixels. World frame, millimetres.
+take turns. A camera is first shifted until the model lies on the picture, then found roughly, on few pixels with as much noise as what does not fit: while
+the picture does not lie on the shape, it says little of lobes. Then all starts are tried again; the best is followed, a few steps a look, until the pose stands
+still beside its own uncertainty, and the last look is fitted with all pixels. World frame, millimetres.
 """
 
 from __future__ import annotations
@@ -173,7 +173,7 @@ def fit_looking(problem: Problem, look: Look) -> tuple[Fitted, CameraFound | Non
 def brought_over(problem: Problem, look: Look) -> Problem:
     """The problem where `look` is shifted across its view so that what the model shows lies on the pictures: what a step finds is within some pixels only.
 
-    Where the pixels of the shape are most alike but for a factor, of all whole shifts at once by Fourier transforms; what is beside the shape is anybody's."""
+    Where the pixels of the shape are most alike but for a factor and what is added, of all whole shifts at once by Fourier transforms; what is beside the shape is anybody's."""
     from scipy.signal import fftconvolve
 
     state = with_best_strengths(problem)
@@ -184,10 +184,11 @@ def brought_over(problem: Problem, look: Look) -> Problem:
             photo.sight.spread(state.predict(state.start(), k, slopes=False).values, 0.0)[::-1, ::-1], photo.saturation
         )
         seen = np.nan_to_num(look.pictures[k])
-        power = fftconvolve(seen**2, mask)
-        # what is nearly black resembles nothing
-        power = np.maximum(power, 0.1 * power.max()) * max(float((shown**2 * mask).sum()), 1e-30)
-        alike = alike + np.maximum(fftconvolve(seen, shown * mask), 0.0) ** 2 / power
+        pattern = (shown - (shown * mask).sum() / max(mask.sum(), 1.0)) * mask
+        power = fftconvolve(seen**2, mask) - fftconvolve(seen, mask) ** 2 / max(mask.sum(), 1.0)
+        # what is nearly even resembles nothing
+        power = np.maximum(power, 0.1 * power.max()) * max(float((pattern**2).sum()), 1e-30)
+        alike = alike + np.maximum(fftconvolve(seen, pattern), 0.0) ** 2 / power
     height, width = state.photographs[0].sight.shape
     most = round(_FARTHEST_SHIFT * max(height, width))
     near = alike[max(height - 1 - most, 0) : height + most, max(width - 1 - most, 0) : width + most]
